@@ -19,6 +19,7 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.extended_kalman_filter import NoiseCovariance
+from lfrtorch.known import Known, Parameter, State
 from lfrtorch.model import Model, load, simulate_blocks
 
 # fits
@@ -56,6 +57,7 @@ __all__ = [
     "Dataset",
     "FitResult",
     "InputError",
+    "Known",
     "LFRCell",
     "LevenbergMarquardt",
     "LfrtorchError",
@@ -66,6 +68,7 @@ __all__ = [
     "NoiseCovariance",
     "Observer",
     "OrderScan",
+    "Parameter",
     "Polynomial",
     "Published",
     "Reason",
@@ -74,6 +77,7 @@ __all__ = [
     "Scaler",
     "Settings",
     "Snapshots",
+    "State",
     "analysis",
     "choose_sizes",
     "datasets",

@@ -16,13 +16,15 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number, quantity
 from lfrtorch._support.threads import each_alone
+from lfrtorch.analysis.physical_parameters import physical_parameters
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
-from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.engine.nonlinearity import is_network, known_parts
 from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.exclusions import allowed
 from lfrtorch.fitting.first_fit import begun_on_part, part_of
+from lfrtorch.fitting.known_start import known_starts
 from lfrtorch.fitting.last_fits import distilled, refitted, without_poor_starts
 from lfrtorch.fitting.multistart import cheap_starts, fit
 from lfrtorch.fitting.observer import LineObserver, Observer
@@ -130,9 +132,10 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
         check_channels(settings.init_from, dataset.train[0])
     dataset = dataset.with_windows()
     stage = replace(given, dataset=dataset)
-    approximated = linear_records(dataset.train, settings, observer)
+    linearly = of_linear_model(settings)
+    approximated = linear_records(dataset.train, linearly, observer)
     linear, order_scan = linear_model(
-        approximated, settings, dataset.validation, observer=observer, ranks=given.ranks
+        approximated, linearly, dataset.validation, observer=observer, ranks=given.ranks
     )
     begun = linear
     choice = None
@@ -147,11 +150,14 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
         begun = linear if settings.nx == choice.nx else estimate(cast(int, settings.nx))
         tell(linear, observer)
     else:
-        settings = replace(settings, nx=linear.nx)
+        settings = settings if settings.known_states else replace(settings, nx=linear.nx)
     stage = replace(stage, settings=settings)
-    settings, models = starting_models(
-        dataset.train, settings, begun, observer, chosen=choice is not None
-    )
+    if settings.known is not None:
+        settings, models = known_starts(stage, linear)
+    else:
+        settings, models = starting_models(
+            dataset.train, settings, begun, observer, chosen=choice is not None
+        )
     settings, models = begun_on_part(replace(stage, settings=settings), models)
     average = _most_averaged(models, settings.average, observer)
     samples = sum(record.samples for record in dataset.train)
@@ -269,6 +275,12 @@ def scored_run(
         trainer=settings.trainer,
         verdict=verdict,
     )
+    known = None
+    if known_parts(model.lfr.cell.static) is not None:
+        of = dataset.train
+        if again is not None:
+            of = all_records(dataset.train, [*dataset.validation, *dataset.selection])
+        known = physical_parameters((again or result).model, of)
     numbers = metrics(
         result,
         evaluation,
@@ -277,6 +289,7 @@ def scored_run(
         verdict=verdict,
         refit=again,
         residuals=residuals,
+        parameters=known,
     )
     return Run(
         dataset=dataset,
@@ -288,10 +301,19 @@ def scored_run(
         refit=again,
         evaluation=evaluation,
         residuals=residuals,
+        parameters=known,
         metrics=numbers,
         verdict=verdict,
         advice=advise(found),
     )
+
+
+def of_linear_model(settings: Settings) -> Settings:
+    """The settings with the order of the linear model that a known one is compared with."""
+    if not settings.known_states:
+        return settings
+    nx = settings.known_states + cast(int, settings.nx)
+    return replace(settings, known=None, init_from=None, nx=nx, nz=1, nw=1, nn=1)
 
 
 def linear_model(
@@ -439,7 +461,7 @@ def linear_models_of_tests(dataset: Dataset, settings: Settings) -> dict[str, Li
     records = {record.name: record for record in dataset.train}
     # Tests that share their records share the model.
     of = list(dict.fromkeys(dataset.linear.values()))
-    estimate = partial(estimate_bla, nx=cast(int, settings.nx), **settings.linear)
+    estimate = partial(estimate_bla, nx=cast(int, of_linear_model(settings).nx), **settings.linear)
     models = each_alone(estimate, [[records[name] for name in names] for names in of])
     by_records = dict(zip(of, models, strict=True))
     return {test: by_records[names] for test, names in dataset.linear.items()}

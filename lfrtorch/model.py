@@ -22,9 +22,10 @@ from lfrtorch._support.checks import integer, reals
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array
 from lfrtorch.data_reach import Cloud, DataReach
-from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
+from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, fixed_entries
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, levels, listed, system_lines
+from lfrtorch.engine.direct_sum import DirectSum
 from lfrtorch.engine.disturbance import (
     disturbance_scale,
     disturbed_cell,
@@ -33,9 +34,10 @@ from lfrtorch.engine.disturbance import (
 )
 from lfrtorch.engine.initial_state import estimated_start
 from lfrtorch.engine.innovation import predictor_cell, split_predictor
+from lfrtorch.engine.known_map import KnownEquations, KnownMap
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import static_slope
-from lfrtorch.engine.nonlinearity import Beyond, Network, Polynomial, base_of, known
+from lfrtorch.engine.nonlinearity import Beyond, Network, Polynomial, base_of, known, known_parts
 from lfrtorch.engine.operating_point import double, equilibrium, linear_part, linearised_at
 from lfrtorch.engine.resampling import resampled_cell
 from lfrtorch.engine.simulation import Trajectory
@@ -204,8 +206,20 @@ class Model:
         """nx, nz, nw, and nn or the degree of a polynomial; nn = 0 for a map of the user's own."""
         cell = self.lfr.cell
         sizes = {"nx": cell.nx, "nz": cell.nz, "nw": cell.nw}
+        if (parts := known_parts(cell.static)) is not None:
+            first, learned = parts
+            sizes = {
+                "nx": cell.nx - first.nx, "nz": cell.nz - first.nz, "nw": cell.nw - first.nw
+            }  # fmt: skip
+            return sizes | ({"nn": 0} if learned is None else learned.sizes)
         static = known(base_of(cell.static))
         return sizes | ({"nn": 0} if static is None else static.sizes)
+
+    @property
+    def known_states(self) -> int:
+        """Number of states of the known model, the first ones; 0 if there is none."""
+        parts = known_parts(self.lfr.cell.static)
+        return 0 if parts is None else parts[0].nx
 
     @property
     def state_covariance(self) -> Float[Array, "nx nx"]:
@@ -257,10 +271,10 @@ class Model:
 
     @property
     def parameter_count(self) -> int:
-        """Number of parameters P; zeros of the structure, and feedthrough held at 0, are none."""
-        zeros = zeros_of(self.lfr.cell)
+        """Number of parameters P; entries that are given, and feedthrough held at 0, are none."""
+        fixed = fixed_entries(self.lfr.cell)
         free = [(name, p) for name, p in self.lfr.cell.named_parameters() if not _zero(p)]
-        return sum(p.numel() - int(zeros[n].sum() if n in zeros else 0) for n, p in free)
+        return sum(p.numel() - int(fixed[n].sum() if n in fixed else 0) for n, p in free)
 
     @property
     def net_parameter_count(self) -> int:
@@ -280,6 +294,10 @@ class Model:
         if cell.structure == "parallel":
             return self.parameter_count - gauge - cell.nz - cell.nw
         static = base_of(cell.static)
+        if (parts := known_parts(static)) is not None:
+            states = cell.nx - parts[0].nx
+            sizes = 0 if parts[1] is None else (cell.nz - parts[0].nz, cell.nw - parts[0].nw)
+            return self.parameter_count - states**2 - sum(size**2 for size in sizes or ())
         if not isinstance(static, Network | Polynomial):
             return self.parameter_count - gauge
         fed = cell.nx // halves * (cell.structure != "hammerstein")
@@ -700,6 +718,7 @@ class Model:
         description |= {name: value for name, value, usual in unless_usual if value != usual}
         weights = dict(self.lfr.cell.state_dict())
         weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in _SCALING}
+        weights |= {f"fixed.{name}": mask.to(cell.A) for name, mask in cell.fixed.items()}
         if self.K is not None:
             weights["K"] = self.K
         if self.reach is not None:
@@ -760,10 +779,20 @@ def state_moment(model: Model, records: Record | Sequence[Record]) -> Float[Tens
     return (total + total.mT) / (2 * samples)
 
 
+_OWN_TYPES = "Network", "Polynomial", "Known", "DirectSum"
+"""Static maps that a checkpoint describes."""
+
+
 def _described(static: Module | None) -> dict[str, Any] | None:
     """Describe a static map for a checkpoint."""
     if static is None:
         return None
+    if isinstance(static, KnownMap):
+        equations = static.equations.described()
+        return {"type": "Known", "equations": equations, "sample_time": static.sample_time}
+    if isinstance(static, DirectSum):
+        parts = [_described(part) for part in static.parts]
+        return {"type": "DirectSum", "parts": parts, "sizes": static.sizes_of_parts}
     if isinstance(static, Beyond):
         return {"type": "Beyond", "base": _described(static.base)}
     match known(static):
@@ -783,6 +812,12 @@ def _made(
             if (found := _made(base, nz, nw, dtype, own)) is None:
                 raise InputError("the static map that a linear one is taken off is missing")
             return Beyond(found, torch.zeros(nw, nz), torch.eye(nz), torch.eye(nw))
+        case {"type": "Known", "equations": equations, "sample_time": sample_time}:
+            return KnownMap(KnownEquations.of(equations), float(sample_time), dtype=dtype)
+        case {"type": "DirectSum", "parts": parts, "sizes": of_parts}:
+            pairs = zip(parts, of_parts, strict=True)
+            made = [_made(part, n_z, n_w, dtype, own) for part, (n_z, n_w) in pairs]
+            return DirectSum([part for part in made if part is not None], of_parts)
         case {"type": "Network", "nn": nn, "activation": activation}:
             return Network(nz, nw, nn, activation, dtype=dtype)
         case {"type": "Polynomial", "degree": degree}:
@@ -818,7 +853,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
     own = made
     while isinstance(own, dict) and own.get("type") == "Beyond":
         own = own.get("base")
-    if isinstance(own, dict) and own.get("type") not in ("Network", "Polynomial") and not static:
+    if isinstance(own, dict) and own.get("type") not in _OWN_TYPES and not static:
         raise InputError(
             f"'{folder}' holds a static nonlinearity of class {own.get('class')}, which is not "
             "part of this package; pass an instance of it: load(folder, static=...)."
@@ -833,7 +868,8 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         dtype = getattr(torch, description["dtype"])
         if not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
             raise InputError(f"dtype is {description['dtype']}")
-        lost = [name for name, tensor in weights.items() if not tensor.isfinite().all()]
+        finite = [name for name in weights if not name.endswith(".bounds")]
+        lost = [name for name in finite if not weights[name].isfinite().all()]
         if lost:
             raise InputError(f"{', '.join(lost)} have numbers that are not finite")
         scaler = Scaler(*(weights.pop(f"scaler.{name}").numpy() for name in _SCALING))
@@ -842,6 +878,8 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         static = _made(made, sizes["nz"], sizes["nw"], dtype, static)
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
         K = weights.pop("K", None)
+        for name in [n for n in weights if n.startswith("fixed.")]:
+            cell.fix(name.removeprefix("fixed."), weights.pop(name) != 0)
         parts = [f"reach.{name}" for name in ("u", "y", "middle", "axes", "ends", "farthest")]
         reach = None
         if parts[0] in weights:

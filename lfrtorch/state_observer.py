@@ -18,6 +18,7 @@ from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.nonlinearity import known_parts
 from lfrtorch.engine.simulation import folded, is_compiled, kernel_arguments
 from lfrtorch.engine.simulation_kernel import simulate_record
 from lfrtorch.records import Channel, Scaler
@@ -58,7 +59,8 @@ class StateObserver(ABC):
         self._cell, self._scaler, self._inputs, self._outputs = cell, scaler, inputs, outputs
         self._u, self._x = np.zeros((1, 1, cell.nu)), np.zeros((1, 2, cell.nx))
         z, w, self._y = (np.zeros((1, 1, size)) for size in (cell.nz, cell.nw, cell.ny))
-        self._weights = kernel_arguments(cell) if is_compiled(cell, cell.A.detach()) else None
+        compiled = is_compiled(cell, cell.A.detach()) and known_parts(cell.static) is None
+        self._weights = kernel_arguments(cell) if compiled else None
         self._call: list[Any] | None = None
         if self._weights is not None:
             self._call = [0, self._u, *self._weights, 0.0, self._x, z, w, self._y]

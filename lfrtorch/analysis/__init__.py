@@ -14,6 +14,7 @@ from lfrtorch.analysis.contraction import Contraction, contraction
 from lfrtorch.analysis.linear_bands import PoleBand, ResponseBand, pole_bands, response_band
 from lfrtorch.analysis.linearisation import linearise
 from lfrtorch.analysis.lpv_form import LPV, lpv
+from lfrtorch.analysis.physical_parameters import PhysicalParameters, physical_parameters
 from lfrtorch.analysis.residual_analysis import Residuals, residuals
 from lfrtorch.analysis.trim import Trim, trim
 from lfrtorch.model import Model
@@ -28,6 +29,7 @@ __all__ = [
     "Bound",
     "Canonical",
     "Contraction",
+    "PhysicalParameters",
     "PoleBand",
     "Residuals",
     "ResponseBand",
@@ -39,6 +41,7 @@ __all__ = [
     "contraction",
     "linearise",
     "lpv",
+    "physical_parameters",
     "plot",
     "pole_bands",
     "residuals",

@@ -27,7 +27,7 @@ from lfrtorch.survey.notes import notes_on
 def configured(cfg: DictConfig) -> Settings:
     """The settings of an identification."""
     require_data(cfg)
-    if cfg.nx is None and cfg.init_from is None:
+    if cfg.nx is None and cfg.init_from is None and cfg.known._target_ is None:
         raise InputError(
             "nx, the number of states, is not set: add nx=2, for example, or nx=auto "
             "(+bench=boucwen sets it and all else for that benchmark)."
@@ -40,6 +40,7 @@ def configured(cfg: DictConfig) -> Settings:
     return Settings(
         **{one.name: plain[one.name] for one in fields(PlainSettings)},
         static=partial(own_map, cfg) if cfg.static.kind == "own" else cfg.static.kind,
+        known=None if cfg.known._target_ is None else instantiate(cfg.known),
         linear=plain["bla"],
         trainer=instantiate(cfg.trainer),
         init_from=None if cfg.init_from is None else opened(cfg),

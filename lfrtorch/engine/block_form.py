@@ -1,4 +1,4 @@
-"""Models that are made of blocks: which of their parameters are 0 for good.
+"""Which parameters of a model a fit leaves as they are: zeros of its blocks, and what is given.
 
 ``LFRCell.structure`` says of which:
 
@@ -23,6 +23,13 @@ STRUCTURES = ("free", "wiener", "hammerstein", "wiener_hammerstein", "parallel")
 
 IN_SERIES = ("wiener_hammerstein", "parallel")
 """Structures with as many states before the static map as after it."""
+
+
+def fixed_entries(cell: LFRCell) -> dict[str, Tensor]:
+    """Entries that a fit leaves as they are: zeros of the structure, and what is given."""
+    zeros = zeros_of(cell)
+    both = {name: mask | zeros.get(name, mask) for name, mask in cell.fixed.items()}
+    return zeros | both
 
 
 def zeros_of(cell: LFRCell) -> dict[str, Tensor]:

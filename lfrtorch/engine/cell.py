@@ -105,6 +105,18 @@ class LFRCell(nn.Module):
         """Number of last inputs that are measured outputs; their Dzu and Dyu stay 0."""
         self._check_shapes()
 
+    def fix(self, name: str, entries: Tensor) -> None:
+        """Let a fit leave entries of a matrix as they are: ``entries`` is a mask of its shape."""
+        if entries.shape != self.get_parameter(name).shape or entries.dtype != torch.bool:
+            raise InputError(f"a mask of {name} is of {entries.dtype} and {tuple(entries.shape)}.")
+        self.register_buffer(f"fixed_{name}", entries.to(self.A.device), persistent=False)
+
+    @property
+    def fixed(self) -> dict[str, Tensor]:
+        """Masks of the entries that a fit leaves as they are, by the names of the matrices."""
+        named = {name: getattr(self, f"fixed_{name}", None) for name in Matrices._fields}
+        return {name: mask for name, mask in named.items() if mask is not None}
+
     def forward(
         self, u: Float[Tensor, "*axes nu"], x: Float[Tensor, "*axes nx"]
     ) -> tuple[Float[Tensor, "*axes ny"], Float[Tensor, "*axes nx"]]:

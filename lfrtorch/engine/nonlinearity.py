@@ -17,6 +17,8 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.memory import check_memory
 from lfrtorch._support.types import Integers
 from lfrtorch.engine.activations import ACTIVATIONS, Activation
+from lfrtorch.engine.direct_sum import DirectSum, DirectSumJacobian
+from lfrtorch.engine.known_map import KnownMap
 from lfrtorch.engine.static_jacobian import (
     ModuleJacobian,
     NetworkJacobian,
@@ -300,5 +302,40 @@ def linearise_static(
     static: Module | None, z: Float[Tensor, "R T nz"], weights: Weights
 ) -> StaticJacobian:
     """A map linearised at z, with the given weights instead of its own."""
+    if isinstance(static, DirectSum):
+        each = z.split([nz for nz, _ in static.sizes_of_parts], dim=-1)
+        of_parts = [static.of_part(number, weights) for number in range(len(each))]
+        triples = zip(static.parts, each, of_parts, strict=True)
+        found = [linearise_static(part, own, weights) for part, own, weights in triples]
+        return DirectSumJacobian(found, [sum(w.numel() for w in ws.values()) for ws in of_parts])
+    if isinstance(static, KnownMap):
+        return static.linearised(z, weights)
     found = known(static)
     return ModuleJacobian(static, z, weights) if found is None else found.linearised(z, weights)
+
+
+def networks_of(static: Module | None) -> list[tuple[str, Network, int, int]]:
+    """The networks in a map: prefix of their weights, network, and its first z and first w."""
+    if is_network(static):
+        return [("static.", static, 0, 0)]
+    found, z, w = [], 0, 0
+    if isinstance(static, DirectSum):
+        for number, (part, (nz, nw)) in enumerate(
+            zip(static.parts, static.sizes_of_parts, strict=True)
+        ):
+            if is_network(part):
+                found.append((f"static.parts.{number}.", part, z, w))
+            z, w = z + nz, w + nw
+    return found
+
+
+def known_parts(static: Module | None) -> tuple[KnownMap, Network | Polynomial | None] | None:
+    """A known model and what is learned beside it, if the map is these."""
+    if isinstance(static, KnownMap):
+        return static, None
+    if isinstance(static, DirectSum) and len(static.parts) == 2:
+        first, second = static.parts
+        learned = known(second)
+        if isinstance(first, KnownMap) and learned is not None:
+            return first, learned
+    return None

@@ -38,7 +38,7 @@ from lfrtorch.engine.feedback_recurrence import states, transition
 from lfrtorch.engine.jacobian_kernel import jacobian_rows
 from lfrtorch.engine.linear_recurrence import linear_recurrence
 from lfrtorch.engine.linearised import PASS, Linearised, linearise_at
-from lfrtorch.engine.nonlinearity import is_network, linearise_static, of_static
+from lfrtorch.engine.nonlinearity import is_network, known_parts, linearise_static, of_static
 from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.engine.static_jacobian import NetworkJacobian, StaticJacobian
 
@@ -247,7 +247,8 @@ class Linearisation:
     def _whole(self) -> _Block | None:
         """All samples, kept from one pass to the next if they are few."""
         R, T = self.u.shape[:2]
-        few = KEPT if has_kernels(self.u) and is_network(self.static) else PASS
+        fast = is_network(self.static) or known_parts(self.static) is not None
+        few = KEPT if has_kernels(self.u) and fast else PASS
         if few < R * T:
             return None
         return self._at(slice(0, R), slice(0, T))

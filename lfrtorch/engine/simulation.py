@@ -11,9 +11,18 @@ from torch import Tensor
 from lfrtorch._support.threads import has_kernels, spread, to_numpy
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.feedback_recurrence import monodromy
+from lfrtorch.engine.known_kernel import simulate_known_record
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.engine.newton import newton_states
-from lfrtorch.engine.nonlinearity import Beyond, Kernel, base_of, known
+from lfrtorch.engine.nonlinearity import (
+    Beyond,
+    Kernel,
+    Network,
+    Polynomial,
+    base_of,
+    known,
+    known_parts,
+)
 from lfrtorch.engine.simulation_kernel import simulate_record
 
 PERIODIC_TOLERANCE = 1e-10
@@ -170,6 +179,8 @@ def steady_state(
 def is_compiled(cell: LFRCell, u: Tensor) -> bool:
     """Whether machine code simulates the cell on the device of ``u``."""
     static = base_of(cell.static)
+    if known_parts(static) is not None and static is cell.static:
+        return has_kernels(u) and u.dtype == torch.float64
     return (static is None or known(static) is not None) and has_kernels(u)
 
 
@@ -226,14 +237,20 @@ def _compiled(
     near.x[:, 0] = x0
     met_within = _MET_ROUNDING * torch.finfo(u.dtype).eps
     simulated = folded(cell)
-    arguments = [to_numpy(u), *kernel_arguments(simulated), met_within]
-    spread(simulate_record, R, *arguments, *(signal.numpy() for signal in near))
+    out = [signal.numpy() for signal in near]
+    if (parts := known_parts(cell.static)) is not None:
+        model, learned = parts
+        weights = [*kernel_arguments(cell, learned), *model.arguments(), *model.kernel()]
+        spread(simulate_known_record, R, to_numpy(u), *weights, met_within, *out)
+        return near
+    spread(simulate_record, R, to_numpy(u), *kernel_arguments(simulated), met_within, *out)
     return near if simulated is cell else signals(cell, u, near.x)
 
 
-def kernel_arguments(cell: LFRCell) -> list[Any]:
+def kernel_arguments(cell: LFRCell, learned: Network | Polynomial | None = None) -> list[Any]:
     """The weights of a cell as ``simulate_record`` takes them, between u and the tolerance."""
-    static, zeros = known(cell.static), cell.A.new_zeros
+    # ``learned`` stands for the static map if that is a known model and this beside it.
+    static, zeros = known(cell.static) or learned, cell.A.new_zeros
     nothing = Kernel(zeros(0, 0), zeros(0, 0), zeros(0), zeros(cell.nw))
     *own, code, growth = nothing if static is None else static.kernel
     lti = (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)

@@ -31,19 +31,7 @@ def simulate_record(
     h = np.empty(Ww.shape[1], u.dtype)
     for k in range(len(u)):
         affine(Cz, x[k], Dzu, u[k], z[k])
-        if len(growth):
-            h[0] = 1.0
-            for n in range(len(growth)):
-                h[n + 1] = h[growth[n, 0]] * z[k, growth[n, 1]]
-        else:
-            for n in range(len(h)):
-                h[n] = bz[n]
-            for j in range(z.shape[1]):
-                for n in range(len(h)):  # neighbours in memory
-                    h[n] += WzT[j, n] * z[k, j]
-            activate(activation, h)
-        for i in range(w.shape[1]):
-            w[k, i] = bw[i] + _dot(Ww[i], h)
+        static_map(WzT, Ww, bz, bw, activation, growth, z[k], h, w[k])
         affine(Cy, x[k], Dyu, u[k], y[k])
         for i in range(len(Dyw)):
             for j in range(w.shape[1]):
@@ -62,6 +50,24 @@ def simulate_record(
             x[k + 1, i] = a
         if met:
             return
+
+
+@njit(nogil=True, inline="always")
+def static_map(WzT, Ww, bz, bw, activation, growth, z, h, w):
+    """Write w of z, by way of the hidden layer h."""
+    if len(growth):
+        h[0] = 1.0
+        for n in range(len(growth)):
+            h[n + 1] = h[growth[n, 0]] * z[growth[n, 1]]
+    else:
+        for n in range(len(h)):
+            h[n] = bz[n]
+        for j in range(len(z)):
+            for n in range(len(h)):  # neighbours in memory
+                h[n] += WzT[j, n] * z[j]
+        activate(activation, h)
+    for i in range(len(w)):
+        w[i] = bw[i] + _dot(Ww[i], h)
 
 
 @njit(nogil=True, inline="always")

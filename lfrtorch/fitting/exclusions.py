@@ -10,7 +10,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.fitting.plain_settings import PlainSettings
 
 USUAL = {one.name: one.default for one in fields(PlainSettings)} | {
-    "static": "network", "guarantee": None, "integrators": 0,
+    "static": "network", "guarantee": None, "integrators": 0, "known": None, "init_from": None,
 }  # fmt: skip
 """Defaults, which exclude nothing."""
 
@@ -59,6 +59,17 @@ EXCLUSIONS = (
     Exclusion("structure", "modes", "a structure has the states of its linear blocks"),
     Exclusion("structure", "z_feedthrough", "its z is of the inputs alone", ("hammerstein",)),
     Exclusion("structure", "static", "its map is a network for each z", ("parallel",)),
+    Exclusion("known", "noise", "the gain of innovations would change what is given"),
+    Exclusion("known", "guarantee", "nothing is proven of a known model"),
+    Exclusion("known", "structure", "its matrices are given"),
+    Exclusion("known", "z_feedthrough", "what is learned beside it sees states and inputs"),
+    Exclusion("known", "feedthrough", "its equations say what acts on the outputs at once"),
+    Exclusion("known", "relaxations", "nx is the number of states beside its own"),
+    Exclusion("known", "modes", "nx is the number of states beside its own"),
+    Exclusion("known", "init", "what is learned beside it begins at zero"),
+    Exclusion("known", "average", "a mean of models has no parameters of its own"),
+    Exclusion("known", "distil", "a mean of models has no parameters of its own"),
+    Exclusion("known", "init_from", "the model brings what is known of it"),
 )
 
 

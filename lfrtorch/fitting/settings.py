@@ -11,6 +11,7 @@ import torch
 from torch.nn import Module
 
 from lfrtorch._support.arguments import typed
+from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.settings import check_settings, documented, setting
 from lfrtorch.engine.cell import check_dtype
@@ -18,6 +19,7 @@ from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.exclusions import USUAL, refuse_together
 from lfrtorch.fitting.plain_settings import PlainSettings, Size
 from lfrtorch.fitting.trainer import Trainer
+from lfrtorch.known import Known
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.model import Model
@@ -29,7 +31,7 @@ SEED_STEP = 1000
 """Distance of the seeds of several starts."""
 
 
-@typed("init_from", "trainer", "static", "nx", "nz", "nw", "nn", "degree", "starts")
+@typed("init_from", "trainer", "static", "known", "nx", "nz", "nw", "nn", "degree", "starts")
 @documented
 @dataclass(frozen=True, kw_only=True)
 class Settings(PlainSettings):
@@ -50,6 +52,11 @@ class Settings(PlainSettings):
         "keywords nz and nw it returns a module from (..., nz) to (..., nw), for example the "
         "module's class.",
     )
+    known: Known | None = setting(
+        None,
+        "a model of the physics; nz, nw and nn or degree are those of the map that is learned "
+        "beside it (nn=0: none), and nx the states beside its own. Default: nothing is known.",
+    )
     linear: Mapping[str, Any] = setting(
         dict, 'options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.'
     )
@@ -69,11 +76,17 @@ class Settings(PlainSettings):
                 f"trainer is {self.trainer!r}; give lfrtorch.LevenbergMarquardt() or "
                 "lfrtorch.Adam()."
             )
+        if self.known is not None and self.nx is None:
+            object.__setattr__(self, "nx", 0)
         if self.init_from is None and self.nx is None:
             raise InputError(
                 "nx, the number of states, is not set: give nx=2, for example, or nx='auto'."
             )
-        check_settings(self, without={} if self.init_from is None else self.init_from.sizes)
+        without = [] if self.init_from is None else [*self.init_from.sizes]
+        if self.known is not None:
+            self._check_known()
+            without += ["nx", "nn"]
+        check_settings(self, without=without)
         if self.init_from is None:
             self._check_sizes()
         else:
@@ -110,6 +123,19 @@ class Settings(PlainSettings):
                 "the device cpu always works."
             ) from None
 
+    def _check_known(self) -> None:
+        """Refuse what is not for a known model."""
+        for name in ("nx", "nz", "nw", "nn", "degree", "ridge"):
+            if getattr(self, name) == "auto":
+                raise InputError(f"{name} is auto, and beside a known model none is searched.")
+        integer("nx", self.nx, 0)
+        integer("nn", self.nn, 0)
+        if callable(self.static):
+            raise InputError(
+                "static is a module of your own; what is learned beside a known model is a "
+                "'network' or a 'polynomial'."
+            )
+
     def _check_sizes(self) -> None:
         known = isinstance(self.static, str) and self.static in LAST_SIZE
         if not (known or callable(self.static)):
@@ -140,6 +166,13 @@ class Settings(PlainSettings):
         given = {name: getattr(self, name, None) for name in {*USUAL} - own}
         parts = {"guarantee": getattr(self.trainer, "guarantee", None)}
         return given | parts | {"integrators": self.linear.get("integrators", 0)}
+
+    @property
+    def known_states(self) -> int:
+        """Number of states of the known model, of the settings or of ``init_from``; 0 for none."""
+        if self.init_from is not None:
+            return self.init_from.known_states
+        return 0 if self.known is None else len(self.known.states)
 
     @property
     def size_names(self) -> tuple[str, ...]:

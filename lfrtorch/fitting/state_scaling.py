@@ -19,14 +19,15 @@ def scale_states(
     # data is wrong by so much. The coordinates change by a diagonal matrix. So zeros of A stay
     # zeros, and its diagonal keeps its bits: an exact integrator stays one, and P of a proof that
     # the model contracts becomes another P. All states stay if one of their matrices is frozen or
-    # start states are given in them (``keep_coordinates``); of a model that diverges, too, and the
-    # covariance is 1.
+    # has entries that are given, or if start states are (``keep_coordinates``); of a model that
+    # diverges, too, and the covariance is 1.
     cell, moment = model.lfr.cell, state_moment(model, records)
     if not torch.isfinite(moment).all():
         moment = torch.eye(cell.nx, dtype=torch.float64)
     rms = moment.diagonal().sqrt()
     into, of = (cell.Bu, cell.Bw), (cell.Cz, cell.Cy)
-    if keep_coordinates or not all(weight.requires_grad for weight in (cell.A, *into, *of)):
+    free = all(weight.requires_grad for weight in (cell.A, *into, *of)) and not cell.fixed
+    if keep_coordinates or not free:
         rms = torch.ones_like(rms)
     rms = torch.where((rms == 0) | ((rms - 1.0).abs() < 1e-9), 1.0, rms)  # what may be rounding
     cell.state_covariance.copy_(moment / torch.outer(rms, rms))

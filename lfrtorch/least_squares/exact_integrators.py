@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from lfrtorch.engine.block_form import zeros_of
+from lfrtorch.engine.block_form import fixed_entries
 from lfrtorch.engine.cell import LFRCell
 
 
@@ -30,13 +30,13 @@ def integrating_states(cell: LFRCell) -> Bool[Tensor, " nx"]:
 def fixed_parameters(cell: LFRCell) -> Bool[Tensor, " free"]:
     """Which entries of the free parameters a fit must not change."""
     # Columns of exact integrators, those of past outputs in a predictor (``engine.innovation``),
-    # and the zeros of a structure (``engine.block_form``).
-    states, zeros = integrating_states(cell), zeros_of(cell)
+    # and the entries that are given (``engine.block_form``).
+    states, fixed = integrating_states(cell), fixed_entries(cell)
     inputs = torch.arange(cell.nu, device=states.device) >= cell.nu - cell.past_outputs
     columns = {"A": states, "Cz": states, "Dzu": inputs, "Dyu": inputs}
     none = states.new_zeros(())
     masks = [
-        (columns.get(name, none) | zeros.get(name, none)).expand(p.shape)
+        (columns.get(name, none) | fixed.get(name, none)).expand(p.shape)
         for name, p in cell.named_parameters()
         if p.requires_grad
     ]

@@ -23,7 +23,7 @@ from torch import Tensor
 from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.engine.nonlinearity import networks_of
 
 DEPENDENT = 1e-3
 """A column is left out if its pivot is at least this fraction of the largest pivot."""
@@ -142,13 +142,17 @@ def _directions(
     T = _units(cell.nx, A)
     changes = {"A": T @ A - A @ T, "Bu": T @ Bu, "Bw": T @ Bw, "Cz": -Cz @ T, "Cy": -cell.Cy @ T}
     groups: list[tuple[dict[str, Tensor], Tensor | None]] = [(changes, initial_states @ T.mT)]
-    if is_network(cell.static):
-        Wz, Ww, bw = cell.static.Wz, cell.static.Ww, cell.static.bw
-        T = _units(cell.nz, A)
-        groups.append(({"Cz": T @ Cz, "Dzu": T @ Dzu, "static.Wz": -Wz @ T}, None))
-        T = _units(cell.nw, A)
-        changes = {"Bw": -Bw @ T, "Dyw": -cell.Dyw @ T, "static.Ww": T @ Ww, "static.bw": T @ bw}
-        groups.append((changes, None))
+    for prefix, network, first_z, first_w in networks_of(cell.static):
+        Wz, Ww, bw = network.Wz, network.Ww, network.bw
+        z, w = slice(first_z, first_z + Wz.shape[1]), slice(first_w, first_w + len(Ww))
+        T = _units(Wz.shape[1], A)
+        changes = {name: A.new_zeros(len(T), *p.shape) for name, p in (("Cz", Cz), ("Dzu", Dzu))}
+        changes["Cz"][:, z], changes["Dzu"][:, z] = T @ Cz[z], T @ Dzu[z]
+        groups.append((changes | {f"{prefix}Wz": -Wz @ T}, None))
+        T, Dyw = _units(len(Ww), A), cell.Dyw
+        changes = {name: A.new_zeros(len(T), *p.shape) for name, p in (("Bw", Bw), ("Dyw", Dyw))}
+        changes["Bw"][..., w], changes["Dyw"][..., w] = -Bw[:, w] @ T, -Dyw[:, w] @ T
+        groups.append((changes | {f"{prefix}Ww": T @ Ww, f"{prefix}bw": T @ bw}, None))
     columns = []
     for changes, states in groups:
         count = len(next(iter(changes.values())))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Literal, Protocol
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.least_squares.box import Box, bounds_of
 from lfrtorch.least_squares.contracting import Contracting
 from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.least_squares.linear_systems import System
@@ -37,5 +39,8 @@ def guarantee_of(name: Name | None, cell: LFRCell, samples: int, ranks: Ranks) -
         return Contracting(cell)
     if isinstance(name, float):
         return Contracting(cell, name)
+    bounds = bounds_of(cell)
+    if name is None and torch.isfinite(bounds).any():
+        return Box(bounds)
     moves = cell.A.requires_grad and not integrating_states(cell).all()
     return Stable(cell, samples, ranks) if name == "stable" and moves else None

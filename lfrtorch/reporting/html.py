@@ -77,7 +77,7 @@ def render(
         command=command or UNKNOWN,
         config=config,
         date=datetime.now().strftime("%d %B %Y, %H:%M"),
-        sizes=static_map(run.metrics["sizes"]),
+        sizes=static_map(run.metrics["sizes"], run.metrics["known_states"]),
         comparisons=comparisons(run.evaluation),
         linear_is_used=run.verdict.use == LINEAR_MODEL,
         scores=_scores(run.metrics, run.evaluation),
@@ -85,6 +85,7 @@ def render(
         records=[{"name": name, "views": list(own.items())} for name, own in (views or {}).items()],
         residuals_legend=RESIDUALS_LEGEND,
         linear=_linear(run.linear, run.fit),
+        known=([], []) if run.parameters is None else run.parameters.rows(),
         fit=_fit(run),
         search=(len(tried), choice_table(tried), LEGEND.splitlines()),
         parameters=[

@@ -8,6 +8,7 @@ from typing import Any
 
 from lfrtorch._support.tables import quantity
 from lfrtorch.analysis.amplitude_margin import LOUDER
+from lfrtorch.analysis.physical_parameters import PhysicalParameters
 from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.choice import Choice
@@ -37,6 +38,7 @@ class Run:
             is scored on the tests; training and validation errors are those of ``fit.model``.
         evaluation: both models on every record.
         residuals: of the record with the largest error, as the report shows them.
+        parameters: of the known model, if the settings have one.
         metrics: what ``metrics.json`` holds: scores by record, sizes, the fit in numbers.
         verdict: whether the NL-LFR is worth more than the linear model.
         advice: what to try next, the most useful first.
@@ -60,6 +62,7 @@ class Run:
     refit: FitResult | None = None
     evaluation: Evaluation
     residuals: Residuals | None = None
+    parameters: PhysicalParameters | None = None
     metrics: Mapping[str, Any]
     verdict: Verdict
     advice: list[Advice]
@@ -90,6 +93,8 @@ class Run:
             parts.append(scores.starts_table(self.metrics, unit) + "\n")
         parts += [f"{said}\n" for said in scores.origins(self.metrics)]
         parts.append(scores.table(self.metrics, self.dataset.published))
+        if self.parameters is not None:
+            parts.append(f"\n{self.parameters}\n")
         if self.metrics["stable_to"] < max(LOUDER):
             parts.append(f"note: {scores.stability(self.metrics['stable_to'])}")
         return "\n".join(parts)

@@ -12,6 +12,7 @@ from typing import Any
 from lfrtorch._support import tables
 from lfrtorch._support.reasons import Reason
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
+from lfrtorch.analysis.physical_parameters import PhysicalParameters
 from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.dataset import LISTED, Published
 from lfrtorch.fitting.choice import Choice
@@ -34,6 +35,7 @@ def metrics(
     verdict: Verdict | None = None,
     refit: FitResult | None = None,
     residuals: Residuals | None = None,
+    parameters: PhysicalParameters | None = None,
 ) -> dict[str, Any]:
     """What ``metrics.json`` holds of a fit, but for its origin; None for what is not finite."""
     # A model fitted again is scored on the tests; validation errors are those before it.
@@ -62,6 +64,7 @@ def metrics(
             "train_before": refit.history[0].train,
             "train": refit.history[refit.chosen_iteration].train,
         },
+        "known": {} if parameters is None else parameters.entries(),
         "residuals": {} if residuals is None else residuals.entries(),
         "stable_to": largest_stable_amplitude(model, dataset.train),
         "starts": max(1, len(result.starts)),
@@ -86,6 +89,7 @@ def scored(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
         "sizes": model.sizes,
         "parameters": model.parameter_count,
         "parameters_net": model.net_parameter_count,
+        "known_states": model.known_states,
         "lti_nx": None if bla is None else bla.nx,
         "data": {"noise_rms": dataset.noise_rms, "notes": list(dataset.notes)},
         "validation": {
@@ -157,8 +161,8 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
         for e in (of["rmse"],)
     ]
     linear = linear_name(result)
-    if sizes["nz"]:
-        shown = static_map(sizes)
+    if sizes["nz"] or result["known_states"]:
+        shown = static_map(sizes, result["known_states"])
     else:
         linear, rows = "linear", [row._replace(linear=row.error, error=None) for row in rows]
     rows = in_units(rows, others)
@@ -214,8 +218,11 @@ def unit_of(result: Mapping[str, Any]) -> str:
     return units.pop() if len(units) == 1 else ""
 
 
-def static_map(sizes: Mapping[str, int]) -> str:
+def static_map(sizes: Mapping[str, int], known_states: int = 0) -> str:
     """The sizes in words."""
+    if known_states:
+        learned = f"; beside it {static_map(sizes)}" if sizes["nz"] else ""
+        return f"a known model of {known_states} state(s){learned}"
     if "degree" in sizes:
         kind = f"polynomial of degree {sizes['degree']}"
     else:

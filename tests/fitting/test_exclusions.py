@@ -14,12 +14,23 @@ from lfrtorch import InputError, LinearModel, Record, Settings, initialise
 from lfrtorch.fitting.exclusions import EXCLUSIONS, USUAL, Exclusion
 from lfrtorch.linear.bla import estimate_bla
 
+KNOWN = lfrtorch.Known(lambda x, u, p: (0.5 * x.h + u[0],), states=["h"], method="discrete")
+
+
+def begun() -> lfrtorch.Model:
+    """A model for a fit to go on from."""
+    u = np.random.default_rng(0).standard_normal(100)
+    record = Record(u, np.convolve(u, [0.0, 0.6, 0.3])[:100])
+    return initialise(estimate_bla(record, 2, max_iter=3), record, nz=1, nw=1, nn=2)
+
+
 OTHERS: dict[str, tuple[Any, ...]] = {
     "static": ("polynomial", torch.nn.Linear),
     "structure": ("wiener", "hammerstein", "wiener_hammerstein", "parallel"),
     "relaxations": (1,), "modes": (2,), "z_feedthrough": (False,),
     "noise": ("innovation", "both"), "horizon": (50,), "first_part": (0.5,), "average": (2,),
     "ridge": (0.1, {"static": 0.1}),
+    "known": (KNOWN,), "init": ("paper",), "init_from": (begun(),), "feedthrough": (False,),
     "distil": (True,), "guarantee": ("stable", "contracting"), "integrators": (1,),
 }  # fmt: skip
 """Values that are no defaults."""

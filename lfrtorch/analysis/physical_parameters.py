@@ -1,0 +1,170 @@
+"""The parameters of a known model: values, standard errors, and what the data cannot tell apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from lfrtorch._support.arguments import typed
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import Cell, in_lines, number, table
+from lfrtorch._support.types import Array
+from lfrtorch.analysis.confidence_bands import uncertainty
+from lfrtorch.engine.nonlinearity import known_parts
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+_ALIKE = 0.95
+"""Correlation from which a note names two parameters."""
+
+_TAKEN_OVER = 10.0
+"""Standard error relative to that with the learned part held, from which a note says so."""
+
+_AT_BOUND = 1e-6
+"""Distance from a bound, of the parameter's scale, that is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhysicalParameters:
+    """Parameters of a known model in their units; ``print(found)`` shows them with notes.
+
+    Args:
+        names, units: of the parameters.
+        values: as fitted.
+        errors: standard errors, of noise that may have a colour; NaN if they are not known.
+        correlation: of the estimates.
+        alone: standard errors if the learned part were known, as far as that has a meaning.
+        notes: what to know of them; empty if there is nothing.
+
+    Shape:
+        values, errors, alone: (n,), correlation: (n, n).
+
+    Example:
+        >>> run = lfrtorch.identify(dataset, lfrtorch.Settings(known=known, nn=0, starts=1))
+        >>> run.parameters.names, run.parameters.values.round(4).tolist()
+        (('stays', 'gain'), [0.7, 0.3])
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Float[Array, " n"]
+    errors: Float[Array, " n"]
+    correlation: Float[Array, "n n"]
+    alone: Float[Array, " n"]
+    notes: tuple[str, ...]
+
+    def rows(self) -> tuple[list[str], list[list[Cell]]]:
+        """Head and rows of a table."""
+        found = [number(v, 4) for v in self.values], [number(e, 2) for e in self.errors]
+        columns = zip(self.names, *found, self.units, strict=True)
+        rows: list[list[Cell]] = [[*row] for row in columns]
+        return ["parameter", "value", "standard error", "unit"], rows
+
+    def __str__(self) -> str:
+        shown = table(*self.rows())
+        return "\n".join([shown, *(in_lines(f"note: {note}") for note in self.notes)])
+
+    def entries(self) -> dict[str, Any]:
+        """Values, standard errors, correlation and notes, for JSON."""
+        columns = zip(self.names, self.values, self.errors, self.units, strict=True)
+        each = {n: {"value": float(v), "error": float(e), "unit": u} for n, v, e, u in columns}
+        return {
+            "values": each,
+            "correlation": self.correlation.tolist(),
+            "notes": list(self.notes),
+        }
+
+
+@typed()
+def physical_parameters(model: Model, records: Record | Sequence[Record]) -> PhysicalParameters:
+    """The parameters of a fitted known model, with standard errors.
+
+    These are the errors by noise, corrected for its colour, of all that was fitted together: what
+    the learned part can say as well as a parameter makes its error large.
+
+    Args:
+        model: with a known model.
+        records: what it was fitted to, with starts, skips and weights as in the fit.
+
+    Raises:
+        ValueError: a model that has no known part.
+
+    References:
+        Ljung, "System Identification: Theory for the User", 2nd ed., 1999, chapter 9.
+        Györök, Hoekstra, Kon, Péni, Schoukens and Tóth, "Orthogonal projection-based regularization
+        for efficient model augmentation", 2025 (what to do about it).
+
+    Example:
+        >>> run = lfrtorch.identify(dataset, lfrtorch.Settings(known=known, nn=0, starts=1))
+        >>> print(lfrtorch.analysis.physical_parameters(run.model, record))
+        parameter      value    standard error  unit
+        ...
+    """
+    parts = known_parts(model.lfr.cell.static)
+    if parts is None:
+        raise InputError(
+            "the model has no known part, so no physical parameters; give Settings(known=...)."
+        )
+    known, learned = parts
+    names, units = known.equations.parameters, known.equations.units
+    scale = known.p_scale.detach().double().cpu().numpy()
+    values = np.array([*known.physical.values()])
+    n = len(names)
+    errors = alone = np.full(n, np.nan)
+    correlation, notes = np.eye(n), []
+    try:
+        found = uncertainty(model, records)
+    except InputError as error:
+        notes.append(f"no standard errors: {error}")
+    else:
+        first, own = 0, slice(0, 0)
+        for _, p in model.lfr.cell.named_parameters():
+            if p is known.p:
+                own = slice(first, first + n)
+            first += p.numel() if p.requires_grad else 0
+        whole = found.covariance
+        part = whole[own, own] * np.outer(scale, scale)
+        errors = np.sqrt(np.diag(part))
+        safe = np.where(errors > 0, errors, 1.0)
+        correlation = part / np.outer(safe, safe)
+        information = np.linalg.pinv(whole, hermitian=True)[own, own]
+        alone = scale * np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
+        notes += _notes(names, errors, correlation, alone, learned=learned is not None)
+        notes += found.doubts
+    low, high = known.bounds.detach().double().cpu().numpy().T
+    at = np.minimum(np.abs(values - low), np.abs(values - high)) <= _AT_BOUND * scale
+    if at.any():
+        listed = ", ".join(name for name, one in zip(names, at, strict=True) if one)
+        notes.append(f"at a bound, so that the standard errors mean little: {listed}.")
+    return PhysicalParameters(names, units, values, errors, correlation, alone, tuple(notes))
+
+
+def _notes(
+    names: Sequence[str],
+    errors: Float[Array, " n"],
+    correlation: Float[Array, "n n"],
+    alone: Float[Array, " n"],
+    *,
+    learned: bool,
+) -> list[str]:
+    """What the data cannot tell apart."""
+    found = []
+    pairs = np.argwhere(np.triu(np.abs(correlation) > _ALIKE, 1))
+    if len(pairs):
+        listed = ", ".join(f"{names[i]} and {names[j]}" for i, j in pairs)
+        found.append(
+            f"the data tell a combination of these rather than each (correlation above {_ALIKE}): "
+            f"{listed}; know one of them, or excite the system in another way."
+        )
+    over = errors > _TAKEN_OVER * np.where(alone > 0, alone, np.inf)
+    if learned and over.any():
+        listed = ", ".join(name for name, one in zip(names, over, strict=True) if one)
+        found.append(
+            f"the learned part can take the place of {listed}: give what a fit with nn=0, nx=0 "
+            "has found as a number, or keep the learned part small with a ridge."
+        )
+    return found

@@ -1,0 +1,199 @@
+"""A known model as a static map: w = [x(k+1); y(k)] of z = [x(k); u(k)], with its parameters.
+
+In an LFR with fixed matrices this is the known model itself; beside it, the LFR learns.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import Module, Parameter
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.threads import has_kernels, spread, to_numpy
+from lfrtorch.engine.formula_code import machine_code
+from lfrtorch.engine.known_kernel import DISCRETE, EULER, RK4, known_slopes
+from lfrtorch.engine.operations import Formula
+from lfrtorch.engine.static_jacobian import ModuleJacobian, StaticJacobian, Weights
+
+METHODS = {"discrete": DISCRETE, "euler": EULER, "rk4": RK4}
+"""How a sample is made of f: its result is the next state, or its rates are integrated."""
+
+
+class KnownEquations(NamedTuple):
+    """x(k+1) or dx/dt = f(x, u; p), y = h(x, u; p), in physical units.
+
+    Args:
+        f, h: functions of [x; u; p].
+        states, parameters: their names.
+        units: of the parameters.
+        inputs: number of u.
+        method: one of ``METHODS``.
+        substeps: steps of the integration in a sample.
+    """
+
+    f: Formula
+    h: Formula
+    states: tuple[str, ...]
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    inputs: int
+    method: str
+    substeps: int
+
+    def described(self) -> dict[str, Any]:
+        """The equations for JSON."""
+        return {**self._asdict(), "f": self.f.described(), "h": self.h.described()}
+
+    @classmethod
+    def of(cls, description: Any) -> KnownEquations:
+        """The equations of a description; anything else is a ValueError."""
+        f, h = (Formula.of(description[name]) for name in ("f", "h"))
+        states, names, units = (
+            tuple(map(str, description[name])) for name in ("states", "parameters", "units")
+        )
+        inputs, substeps = int(description["inputs"]), int(description["substeps"])
+        size = len(states) + inputs + len(names)
+        fits = f.inputs == h.inputs == size and len(f.results) == len(states) and substeps > 0
+        if not fits or description["method"] not in METHODS:
+            raise InputError("its known equations do not fit each other")
+        return cls(f, h, states, names, units, inputs, description["method"], substeps)
+
+
+class KnownMap(Module):
+    """The map of known equations, of normalised signals and parameters.
+
+    Args:
+        equations: in physical units.
+        sample_time: in seconds.
+        device, dtype: of the weights, as in any torch module.
+
+    Shape:
+        p: (parameters,), in units of ``p_scale``. z: (..., nx + nu), w: (..., nx + ny). Offsets and
+        scales of z, w and p, and ``bounds``, (parameters, 2), are buffers.
+    """
+
+    of_z: Tensor
+    of_w: Tensor
+    p_scale: Tensor
+    bounds: Tensor
+
+    def __init__(
+        self,
+        equations: KnownEquations,
+        sample_time: float,
+        *,
+        device: torch.device | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        self.equations, self.sample_time = equations, sample_time
+        nx, count = len(equations.states), len(equations.parameters)
+        nz, nw = nx + equations.inputs, nx + len(equations.h.results)
+        self.nx, self.nz, self.nw = nx, nz, nw
+        like: dict[str, Any] = {"device": device, "dtype": dtype}
+        self.p = Parameter(torch.ones(count, **like))
+        for name, size in (("of_z", nz), ("of_w", nw)):
+            self.register_buffer(name, torch.tensor([0.0, 1.0], **like).repeat(size, 1))
+        self.register_buffer("p_scale", torch.ones(count, **like))
+        ends = torch.tensor([-torch.inf, torch.inf], **like)
+        self.register_buffer("bounds", ends.repeat(count, 1))
+
+    def weight_shapes(self, nz: int, nw: int) -> dict[str, tuple[int, ...]]:
+        """Shapes of the weights and buffers; nz and nw follow from the equations."""
+        count = len(self.equations.parameters)
+        scaling = {"of_z": (self.nz, 2), "of_w": (self.nw, 2), "bounds": (count, 2)}
+        return {"p": (count,), "p_scale": (count,), **scaling}
+
+    @property
+    def physical(self) -> dict[str, float]:
+        """The parameters in their units, by name."""
+        values = (self.p * self.p_scale).detach().double().cpu().tolist()
+        return dict(zip(self.equations.parameters, values, strict=True))
+
+    @property
+    def step(self) -> float:
+        """Seconds of one step of the integration."""
+        return self.sample_time / self.equations.substeps
+
+    def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
+        """w of z."""
+        v = self.of_z[:, 0] + self.of_z[:, 1] * z
+        signals, p = v.unbind(-1), (self.p * self.p_scale).unbind(-1)
+        x, u = torch.stack(signals[: self.nx], -1), signals[self.nx :]
+        parameters = [each.expand(z.shape[:-1]) for each in p]
+
+        def of(formula: Formula, x: Tensor) -> Tensor:
+            return torch.stack(formula(*x.unbind(-1), *u, *parameters), -1)
+
+        f, h, step = self.equations.f, self.equations.h, self.step
+        y = of(h, x)
+        if self.equations.method == "discrete":
+            x = of(f, x)
+        else:
+            for _ in range(self.equations.substeps):
+                k1 = of(f, x)
+                if self.equations.method == "euler":
+                    x = x + step * k1
+                    continue
+                k2 = of(f, x + 0.5 * step * k1)
+                k3 = of(f, x + 0.5 * step * k2)
+                k4 = of(f, x + step * k3)
+                x = x + step / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
+        return (torch.cat([x, y], -1) - self.of_w[:, 0]) / self.of_w[:, 1]
+
+    def kernel(self, *, slopes: bool = False) -> list[Any]:
+        """The map as ``known_kernel`` takes it, between p and w; ``slopes``: with derivatives."""
+        e = self.equations
+        f, h = (machine_code(each, slopes=slopes) for each in (e.f, e.h))
+        return [f, h, self.nx, METHODS[e.method], self.step, e.substeps]
+
+    def arguments(self, p: Tensor | None = None) -> list[Any]:
+        """Scaling and physical parameters as ``known_kernel`` takes them."""
+        own = self.p if p is None else p
+        return [to_numpy(self.of_z), to_numpy(self.of_w), to_numpy(own * self.p_scale)]
+
+    def linearised(self, z: Float[Tensor, "R T nz"], weights: Weights) -> StaticJacobian:
+        """The map linearised at z, with the given weights."""
+        if not (has_kernels(z) and z.dtype == torch.float64):
+            return ModuleJacobian(self, z, weights)
+        return KnownJacobian(self, z, weights["p"])
+
+    def extra_repr(self) -> str:
+        """States and parameters, for ``print(module)``."""
+        values = ", ".join(f"{name}={value:.6g}" for name, value in self.physical.items())
+        return f"{', '.join(self.equations.states)}; {values}"
+
+
+class KnownJacobian:
+    """A known model in machine code: derivatives of one step, exact through the integration."""
+
+    def __init__(self, of: KnownMap, z: Float[Tensor, "R T nz"], p: Float[Tensor, " p"]) -> None:
+        R, T = z.shape[:2]
+        self.J = z.new_empty(R, T, of.nw, of.nz)
+        self._by_p = z.new_empty(R, T, of.nw, len(p))
+        scaling = [*of.arguments(p), to_numpy(of.p_scale)]
+        outputs = self.J.numpy(), self._by_p.numpy()
+        spread(known_slopes, R, to_numpy(z), *scaling, *of.kernel(slopes=True), *outputs)
+
+    def part(self, records: slice, time: slice) -> StaticJacobian:
+        """The same for some of the records and samples."""
+        part = copy.copy(self)
+        part.J, part._by_p = self.J[records, time], self._by_p[records, time]
+        return part
+
+    def by_weight(self) -> Float[Tensor, "R T nw weights"]:
+        """∂w/∂φ."""
+        return self._by_p
+
+    def tangent(self, d_weights: Float[Tensor, " weights"]) -> Float[Tensor, "R T nw"]:
+        """(∂w/∂φ) dφ."""
+        return (self._by_p @ d_weights[..., None, :, None]).squeeze(-1)
+
+    def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R weights"]:
+        """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
+        return torch.einsum("rtqp,rtq->rp", self._by_p, d_w)

@@ -1,0 +1,214 @@
+"""Where a fit of a known model starts: its parameters first, and then what is learned beside it.
+
+The LFR has the known model as a block of its static map, with matrices that are given: they take
+x and u to it, and its next state and output from it. Beside it stand a network (or polynomial) and
+``nx`` states, which see all states and inputs, and act on all states and outputs. The learned part
+begins at zero, so the model begins as the known one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lfrtorch._support.reasons import CUT_SHORT
+from lfrtorch._support.tables import number, quantity
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.direct_sum import DirectSum
+from lfrtorch.engine.known_map import KnownMap
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.nonlinearity import Network, Polynomial, known_parts
+from lfrtorch.fitting.driven_states import relaxation_frequencies
+from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.settings import Settings
+from lfrtorch.fitting.stage import Stage
+from lfrtorch.fitting.trainer import StoppedError
+from lfrtorch.known import Known
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
+from lfrtorch.records import Record, Scaler, common_unit, rms_scale
+
+_ITERATIONS = 60
+"""Of the first fit, to the parameters alone; there are few of them."""
+
+_STARTS, _SPREAD = 8, 0.5
+"""Values of the parameters that it starts from, and the deviation of the logarithms of others."""
+
+_REACH = 0.3
+"""Largest weight of w on a state or an output, of unit rms, at the start."""
+
+
+def known_model(known: Known, linear: LinearModel, records: Sequence[Record]) -> Model:
+    """The known model itself as an LFR; signals have the offsets of the linear model."""
+    first = records[0]
+    nu, ny, nx = len(first.inputs), len(first.outputs), len(known.states)
+    scaler = Scaler(
+        linear.u_offset,
+        rms_scale([r.u for r in records], linear.u_offset),
+        linear.y_offset,
+        rms_scale([r.y for r in records], linear.y_offset),
+    )
+    static = known.map(nu, ny, first.fs)
+    with torch.no_grad():
+        for ends, place, offset, scale in (
+            (static.of_z, nx, scaler.u_offset, scaler.u_scale),
+            (static.of_w, nx, scaler.y_offset, scaler.y_scale),
+        ):
+            ends[place:] = torch.as_tensor(np.stack([offset, scale], axis=1))
+    cell = around(static, nx, nu, ny)
+    model = Model(LFR(cell), scaler, first.fs, first.inputs, first.outputs)
+    x = torch.cat([model.signals(record).x[0] for record in records])
+    rms = x.square().mean(dim=0).sqrt()
+    with torch.no_grad():
+        for i, state in enumerate(known.states):
+            if state.scale is None and torch.isfinite(rms[i]) and rms[i] > 0:
+                static.of_z[i, 1] = static.of_w[i, 1] = rms[i]
+    return model
+
+
+def around(
+    static: KnownMap,
+    nx: int,
+    nu: int,
+    ny: int,
+    *,
+    learned: Network | Polynomial | None = None,
+    nz: int = 0,
+    nw: int = 0,
+    states: int = 0,
+) -> LFRCell:
+    """The cell around a known model and, beside it, a learned map and learned states; all at 0."""
+    whole = static
+    if learned is not None:
+        whole = DirectSum([static, learned], [(static.nz, static.nw), (nz, nw)])
+    sizes = nu, ny, nx + states, static.nz + nz, static.nw + nw
+    cell = LFRCell(*sizes, whole, dtype=static.p.dtype, device=static.p.device)
+    with torch.no_grad():
+        cell.Cz[:nx, :nx], cell.Dzu[nx : nx + nu] = torch.eye(nx), torch.eye(nu)
+        cell.Bw[:nx, :nx], cell.Dyw[:, nx : nx + ny] = torch.eye(nx), torch.eye(ny)
+    x, z, w = (torch.arange(n) for n in (nx + states, static.nz + nz, static.nw + nw))
+    own_x, own_z, own_w = x < nx, z < static.nz, w < static.nw
+    given = {
+        "A": own_x[:, None] & own_x, "Bu": own_x[:, None].expand(-1, nu),
+        "Bw": own_w.expand(len(x), -1), "Cz": own_z[:, None].expand(-1, len(x)),
+        "Dzu": own_z[:, None].expand(-1, nu), "Cy": own_x.expand(ny, -1),
+        "Dyu": torch.ones(ny, nu, dtype=torch.bool), "Dyw": own_w.expand(ny, -1),
+    }  # fmt: skip
+    for name, mask in given.items():
+        cell.fix(name, mask.clone())
+    return cell
+
+
+def with_learned(model: Model, records: Sequence[Record], settings: Settings, seed: int) -> Model:
+    """A known model with what is to be learned beside it, which is zero still."""
+    parts = known_parts(model.lfr.cell.static)
+    assert parts is not None
+    static, old = deepcopy(parts[0]), model.lfr.cell
+    nx, states = old.nx, cast(int, settings.nx)
+    generator = torch.Generator().manual_seed(seed)
+    learned = learned_map(settings, generator)
+    nz, nw = (0, 0) if learned is None else (cast(int, settings.nz), cast(int, settings.nw))
+    cell = around(static, nx, old.nu, old.ny, learned=learned, nz=nz, nw=nw, states=states)
+
+    def uniform(entries: Tensor, limit: float = 1.0) -> None:
+        entries.uniform_(-limit, limit, generator=generator)
+
+    with torch.no_grad():
+        found = [model.signals(record) for record in records]
+        x = torch.cat([t.x[0, :-1] for t in found])
+        u = torch.cat([torch.as_tensor(model.scaler.normalise_u(r.u)) for r in records])
+        if states:
+            corners = relaxation_frequencies([record.u for record in records], states)
+            decay = torch.as_tensor(np.exp(-corners))
+            cell.A[nx:, nx:] = torch.diag(decay)
+            uniform(cell.Bu[nx:])
+            cell.Bu[nx:] *= (1.0 - decay.square()).sqrt()[:, None]
+        if learned is not None:
+            own_z, own_w = slice(static.nz, None), slice(static.nw, None)
+            uniform(cell.Cz[own_z])
+            uniform(cell.Dzu[own_z])
+            z = x @ cell.Cz[own_z, :nx].mT + u @ cell.Dzu[own_z].mT
+            rms = z.square().mean(dim=0).sqrt().clamp_min(1e-6)
+            rms = torch.where(torch.isfinite(rms), rms, 1.0)
+            cell.Cz[own_z] /= rms[:, None]
+            cell.Dzu[own_z] /= rms[:, None]
+            uniform(cell.Bw[:, own_w], _REACH)
+            uniform(cell.Dyw[:, own_w], _REACH)
+            for name in ("Ww", "bw") if isinstance(learned, Network) else ("C",):
+                learned.get_parameter(name).zero_()
+    return replace(model, lfr=LFR(cell))
+
+
+def learned_map(settings: Settings, generator: torch.Generator) -> Network | Polynomial | None:
+    """The map that is learned beside a known model; None if none is asked for."""
+    nz, nw, nn = (cast(int, size) for size in (settings.nz, settings.nw, settings.nn))
+    if settings.static == "polynomial":
+        return Polynomial(nz, nw, cast(int, settings.degree), dtype=torch.float64)
+    if nn == 0:
+        return None
+    found = Network(nz, nw, nn, settings.activation, dtype=torch.float64)
+    found.reset_parameters(generator)
+    return found
+
+
+def varied(model: Model, seed: int) -> Model:
+    """The known model with other parameters: within the bounds, and else by a random factor."""
+    found = deepcopy(model)
+    parts = known_parts(found.lfr.cell.static)
+    assert parts is not None
+    static, random = parts[0], np.random.default_rng(seed)
+    low, high = (static.bounds / static.p_scale[:, None]).numpy().T
+    p = static.p.detach().numpy().copy()
+    shifted = np.where(p == 0.0, _SPREAD * random.standard_normal(len(p)), p)
+    p = np.where(p == 0.0, shifted, p * np.exp(_SPREAD * random.standard_normal(len(p))))
+    with torch.no_grad():
+        static.p.copy_(torch.as_tensor(np.clip(p, low, high)))
+    return found
+
+
+def known_starts(stage: Stage, linear: LinearModel) -> tuple[Settings, list[Model]]:
+    """The settings with the number of starts, and their models."""
+    dataset, settings, observer = stage.dataset, stage.settings, stage.observer
+    known, trainer = cast(Known, settings.known), cast(Any, settings.trainer)
+    model = known_model(known, linear, dataset.train)
+    count = _STARTS if settings.starts == "auto" else settings.starts
+    settings = replace(settings, starts=count)
+    seeds = settings.seeds
+    if settings.nn == 0 and not settings.nx and settings.static == "network":
+        return settings, [model, *(varied(model, seed) for seed in seeds[1:])]
+    if known.parameters:
+        options: Any = {**stage.options, "ridge": 0.0}
+        options["trainer"] = replace(trainer, max_iter=_ITERATIONS)
+        monitor = observer.searching()
+        begun = [model, *(varied(model, settings.seed + n) for n in range(1, _STARTS))]
+        result = fit(
+            begun,
+            dataset.train,
+            dataset.validation,
+            dataset.selection,
+            monitors=None if monitor is None else [[monitor]] * len(begun),
+            **options,
+        )
+        if result.reason in CUT_SHORT:
+            raise StoppedError("stopped during the fit to the parameters of the known model")
+        model = result.model
+        error = result.history[result.chosen_iteration].train
+        values = ", ".join(f"{name} {number(value)}" for name, value in physical(model).items())
+        observer.say(
+            f"known model: {values}; error {quantity(error, common_unit(model.outputs))} in "
+            f"training, {quantity(result.seconds, 's')}"
+        )
+    model.lfr.to(device=settings.device, dtype=settings.dtype)
+    return settings, [with_learned(model, dataset.train, settings, seed) for seed in seeds]
+
+
+def physical(model: Model) -> dict[str, float]:
+    """The parameters of a known model in their units; none of another model."""
+    parts = known_parts(model.lfr.cell.static)
+    return {} if parts is None else parts[0].physical

@@ -1,0 +1,222 @@
+"""A model that is known: equations in physical units, with parameters that a fit may find."""
+
+from __future__ import annotations
+
+import math
+from collections import namedtuple
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from lfrtorch._support.arguments import typed
+from lfrtorch._support.checks import integer, number, reals
+from lfrtorch._support.errors import InputError
+from lfrtorch.engine.known_map import METHODS, KnownEquations, KnownMap
+from lfrtorch.engine.operations import Formula, UntraceableError
+
+
+@typed()
+@dataclass(frozen=True)
+class Parameter:
+    """A physical parameter that a fit finds.
+
+    Args:
+        value: where the fit starts.
+        low, high: bounds that it keeps.
+        unit: as in "kg".
+        scale: by how much it may change in a fit, about. Default: |value|, or the distance of the
+            bounds, or 1.
+
+    Raises:
+        ValueError: a value beyond the bounds, or a scale that is not positive.
+
+    Example:
+        >>> lfrtorch.Parameter(0.5, low=0.0, unit="kg")
+        Parameter(value=0.5, low=0.0, high=inf, unit='kg', scale=None)
+    """
+
+    value: float
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = ""
+    scale: float | None = None
+
+    def __post_init__(self) -> None:
+        _finite("value", self.value)
+        if not self.low <= self.value <= self.high or self.low == self.high:
+            raise InputError(
+                f"a parameter's value is {self.value}, its bounds {self.low} and {self.high}; give "
+                "low <= value <= high, and a parameter that is known as a number in the equations."
+            )
+        if self.scale is not None:
+            number("scale", self.scale, positive=True)
+
+    @property
+    def size(self) -> float:
+        """The scale."""
+        between = self.high - self.low
+        return self.scale or abs(self.value) or (between if math.isfinite(between) else 1.0)
+
+
+@typed()
+@dataclass(frozen=True)
+class State:
+    """A state in its unit.
+
+    Args:
+        name: as the equations call it.
+        unit: as in "rad/s".
+        rest: where it is at rest, and where a record with ``start="zero"`` begins.
+        scale: its rms about that, roughly. Default: that of a simulation of the training records.
+
+    Example:
+        >>> lfrtorch.State("speed", unit="m/s")
+        State(name='speed', unit='m/s', rest=0.0, scale=None)
+    """
+
+    name: str
+    unit: str = ""
+    rest: float = 0.0
+    scale: float | None = None
+
+    def __post_init__(self) -> None:
+        _finite("rest", self.rest)
+        if self.scale is not None:
+            number("scale", self.scale, positive=True)
+
+
+@typed()
+class Known:
+    """A model of the physics: dx/dt = f(x, u, p), y = h(x, u, p), or x(k+1) = f(x, u, p).
+
+    All signals and parameters are in physical units. ``f`` and ``outputs`` are functions of torch's
+    functions: x and p have the states and parameters by name, u the inputs in their order. They are
+    called once, and what they compute is written down: a model needs them no more.
+
+    Args:
+        f: the rates, or the next states with ``method="discrete"``: a tuple, one for each state.
+        states: names, or a :class:`State` each.
+        parameters: what a fit finds, by name: a :class:`Parameter`, or a number to start from.
+        outputs: y, a tuple. Default: the first states, one for each output of the data.
+        method: how a sample is made of f, with inputs that are held over it: ``"rk4"``, the
+            classical method of Runge and Kutta, ``"euler"``, or ``"discrete"``.
+        substeps: steps of the method in a sample.
+
+    Raises:
+        ValueError: names that are no Python names or stand twice, or, once it meets data, functions
+            that are not made of single numbers and torch's elementary functions.
+
+    Example:
+        >>> def pendulum(x, u, p):
+        ...     return x.speed, u[0] - p.damping * x.speed - p.gravity * torch.sin(x.angle)
+        >>> known = lfrtorch.Known(
+        ...     pendulum,
+        ...     states=["angle", lfrtorch.State("speed", unit="rad/s")],
+        ...     parameters={"damping": lfrtorch.Parameter(0.1, low=0.0), "gravity": 9.81},
+        ... )
+        >>> known
+        Known(pendulum: angle, speed; damping, gravity)
+    """
+
+    def __init__(
+        self,
+        f: Callable[..., Any],
+        *,
+        states: Sequence[str] | Sequence[State] | Sequence[str | State],
+        parameters: Mapping[str, Any] | None = None,
+        outputs: Callable[..., Any] | None = None,
+        method: Literal["rk4", "euler", "discrete"] = "rk4",
+        substeps: int = 1,
+    ) -> None:
+        self.f, self.outputs, self.method, self.substeps = f, outputs, method, substeps
+        self.states = tuple(s if isinstance(s, State) else State(s) for s in states)
+        self.parameters = {
+            name: value if isinstance(value, Parameter) else Parameter(value)
+            for name, value in (parameters or {}).items()
+        }
+        integer("substeps", substeps, 1)
+        if method not in METHODS or (method == "discrete" and substeps > 1):
+            raise InputError(
+                f"method is {method!r} and substeps {substeps}; give one of {', '.join(METHODS)}, "
+                "and substeps=1 with 'discrete'."
+            )
+        if not self.states:
+            raise InputError("states is empty; name at least one.")
+        try:
+            self._x = namedtuple("x", [state.name for state in self.states])
+            self._p = namedtuple("p", self.parameters)
+        except (ValueError, TypeError) as error:
+            raise InputError(f"a name of a state or parameter cannot be one: {error}.") from None
+
+    def __repr__(self) -> str:
+        name = getattr(self.f, "__name__", type(self.f).__name__)
+        return f"Known({name}: {', '.join(self._x._fields)}; {', '.join(self.parameters)})"
+
+    def equations(self, nu: int, ny: int) -> KnownEquations:
+        """The equations as tables of operations, for so many inputs and outputs.
+
+        Raises:
+            ValueError: functions that have no table, or return other numbers of values.
+        """
+        nx, count = len(self.states), len(self.parameters)
+
+        def traced(function: Callable[..., Any], what: str, results: int) -> Formula:
+            def of_scalars(*v: Any) -> Any:
+                x, u, p = v[:nx], v[nx : nx + nu], v[nx + nu :]
+                return function(self._x(*x), tuple(u), self._p(*p))
+
+            try:
+                found = Formula.traced(of_scalars, nx + nu + count)
+            except UntraceableError as error:
+                raise InputError(f"{what} of the known model: {error}") from None
+            except (AttributeError, IndexError, TypeError, ValueError) as error:
+                raise InputError(
+                    f"{what} of the known model fails: {error}. It is called as {what}(x, u, p) "
+                    f"with {nx} states, {nu} input(s) and {count} parameters, single numbers each."
+                ) from None
+            if len(found.results) != results:
+                raise InputError(
+                    f"{what} of the known model returns {len(found.results)} values; give "
+                    f"{results}, one for each {'state' if what == 'f' else 'output of the data'}."
+                )
+            return found
+
+        outputs = self.outputs
+        if outputs is None:
+            if nx < ny:
+                raise InputError(
+                    f"the known model has {nx} state(s) and the data {ny} outputs; give outputs=, "
+                    "a function of (x, u, p) that returns a value for each output."
+                )
+            outputs = _first_states(ny)
+        f, h = traced(self.f, "f", nx), traced(outputs, "outputs", ny)
+        names = tuple(self._x._fields), tuple(self.parameters)
+        units = tuple(parameter.unit for parameter in self.parameters.values())
+        return KnownEquations(f, h, *names, units, nu, self.method, self.substeps)
+
+    def map(self, nu: int, ny: int, fs: float) -> KnownMap:
+        """The equations as a static map of an LFR, of signals in physical units, in float64."""
+        found = KnownMap(self.equations(nu, ny), 1.0 / fs, dtype=torch.float64)
+        with torch.no_grad():
+            for i, parameter in enumerate(self.parameters.values()):
+                found.p_scale[i] = parameter.size
+                found.p[i] = parameter.value / parameter.size
+                found.bounds[i] = torch.tensor([parameter.low, parameter.high], dtype=torch.float64)
+            for i, state in enumerate(self.states):
+                scale = 1.0 if state.scale is None else state.scale
+                ends = torch.tensor([state.rest, scale], dtype=torch.float64)
+                found.of_z[i] = found.of_w[i] = ends
+        return found
+
+
+def _finite(name: str, value: Any) -> None:
+    if not np.isfinite(reals(name, value)).all() or np.ndim(value):
+        raise InputError(f"{name} is {value!r}; give a finite number.")
+
+
+def _first_states(count: int) -> Callable[..., Any]:
+    """Outputs that are states."""
+    return lambda x, u, p: x[:count]

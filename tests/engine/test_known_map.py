@@ -1,0 +1,128 @@
+"""A known model in machine code against its equations in torch, alone and in an LFR."""
+
+import pytest
+import reference
+import torch
+from torch.testing import assert_close
+
+from lfrtorch.engine import simulation
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.direct_sum import DirectSum
+from lfrtorch.engine.known_map import KnownEquations, KnownMap
+from lfrtorch.engine.nonlinearity import Network, Polynomial, linearise_static, of_static
+from lfrtorch.engine.operations import Formula
+from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
+from lfrtorch.engine.static_jacobian import ModuleJacobian
+
+pytestmark = pytest.mark.numeric
+
+METHODS = ["rk4", "euler", "discrete"]
+
+
+def rates(h1, h2, u, a, b, k):
+    def root(v):
+        return torch.sqrt(v.clamp(min=1e-3))
+
+    over = torch.relu(h1 - 1.5)
+    return -a * root(h1) + k * u - over, a * root(h1) - b * root(h2) + 0.3 * over
+
+
+def next_state(*v):
+    return [x + 0.1 * change for x, change in zip(v, rates(*v), strict=False)]
+
+
+def known_map(method: str) -> KnownMap:
+    f = Formula.traced(next_state if method == "discrete" else rates, 6)
+    h = Formula.traced(lambda h1, h2, u, a, b, k: [h2 + 0.1 * a * u], 6)
+    substeps = 1 if method == "discrete" else 3
+    names = ("h1", "h2"), ("a", "b", "k"), ("", "", "1/s")
+    equations = KnownEquations(f, h, *names, 1, method, substeps)
+    found = KnownMap(equations, 0.2, dtype=torch.float64)
+    with torch.no_grad():
+        found.p_scale.copy_(torch.tensor([0.3, 0.2, 0.4]))
+        found.of_z.copy_(torch.tensor([[0.1, 2.0], [0.2, 1.5], [1.0, 0.7]]))
+        found.of_w.copy_(torch.tensor([[0.1, 2.0], [0.2, 1.5], [0.5, 1.3]]))
+    return found
+
+
+def cells(method: str) -> list[LFRCell]:
+    """The known model alone, with a network and with a polynomial beside it, and a state more."""
+    generator = torch.Generator().manual_seed(0)
+    found = []
+    for learned in (None, Network(2, 1, 4), Polynomial(2, 1, 2)):
+        static, size = known_map(method), 3
+        if learned is not None:
+            static, size = DirectSum([static, learned.double()], [(3, 3), (2, 1)]), 5
+        cell = LFRCell(1, 1, 3, size, size - (learned is not None), static, dtype=torch.float64)
+        with torch.no_grad():
+            cell.Cz[:2, :2], cell.Dzu[2], cell.Bw[:2, :2], cell.Dyw[0, 2] = (
+                torch.eye(2), 1.0, torch.eye(2), 1.0
+            )  # fmt: skip
+            cell.A[2, 2], cell.Bu[2, 0] = 0.5, 0.3
+            for entries in (cell.Cz[3:], cell.Dzu[3:], cell.Bw[:, 3:], cell.Dyw[:, 3:]):
+                entries.uniform_(-0.1, 0.1, generator=generator)
+        found.append(cell)
+    return found
+
+
+def signals(cell: LFRCell):
+    generator = torch.Generator().manual_seed(1)
+    u = torch.rand(2, 40, 1, dtype=torch.float64, generator=generator)
+    return u, torch.rand(2, cell.nx, dtype=torch.float64, generator=generator)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_machine_code_simulates_the_equations(method: str):
+    for cell in cells(method):
+        u, x0 = signals(cell)
+        assert simulation.is_compiled(cell, u)
+        found = simulation.simulate(cell, u, x0)
+        for r in range(len(u)):
+            expected = reference.nl_lfr(cell, reference.weights(cell), u[r], x0[r])
+            for part, own in zip(found, expected, strict=True):
+                assert_close(part[r], own, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_derivatives_are_those_of_torch_func(method: str):
+    for cell in cells(method):
+        u, x0 = signals(cell)
+        trajectory = simulation.simulate(cell, u, x0)
+        weights = {n: w.detach() for n, w in of_static(dict(cell.named_parameters())).items()}
+        found = linearise_static(cell.static, trajectory.z, weights)
+        expected = ModuleJacobian(cell.static, trajectory.z, weights)
+        assert_close(found.J, expected.J)
+        assert_close(found.by_weight(), expected.by_weight())
+        d_w, d_weights = torch.rand_like(trajectory.w), torch.rand(expected.by_weight().shape[-1])
+        assert_close(found.tangent(d_weights.double()), expected.tangent(d_weights.double()))
+        assert_close(found.adjoint(d_w), expected.adjoint(d_w))
+        part = found.part(slice(1, 2), slice(3, 7))
+        assert_close(part.by_weight(), expected.by_weight()[1:2, 3:7])
+
+
+def test_jacobian_of_the_outputs_is_that_of_the_recurrence():
+    for cell in cells("rk4"):
+        u, x0 = signals(cell)
+        along = Linearisation(cell, u, simulation.simulate(cell, u, x0))
+        found = output_jacobian(along)[0]
+        theta = reference.weights(cell)
+
+        def y(theta, x0, cell=cell, u=u):
+            return reference.nl_lfr(cell, theta, u[0], x0).y
+
+        by_theta, by_x0 = torch.func.jacrev(y, argnums=(0, 1))(theta, x0[0])
+        expected = torch.cat([*(by_theta[name].flatten(2) for name in theta), by_x0], dim=-1)
+        assert_close(found, expected, rtol=1e-8, atol=1e-10)
+
+
+def test_equations_survive_a_description():
+    equations = known_map("rk4").equations
+    assert KnownEquations.of(equations.described()) == equations
+    with pytest.raises(ValueError, match="do not fit"):
+        KnownEquations.of(equations.described() | {"method": "bdf"})
+    with pytest.raises(ValueError, match="do not fit"):
+        KnownEquations.of(replace_states(equations))
+
+
+def replace_states(equations: KnownEquations):
+    return equations._replace(states=("h1",)).described()
