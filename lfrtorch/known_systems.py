@@ -30,7 +30,7 @@ def cascaded_tanks() -> Known:
         return p_gain * torch.exp(power * torch.log(level.clamp(min=_EMPTY)))
 
     def rates(x, u, p):
-        first = drain(x.h1 + p.below1, p.out1, p.power1)
+        first = drain(x.h1, p.out1, p.power1)
         second = drain(x.h2 + p.below2, p.out2, p.power2)
         over = _SPILLS * torch.relu(x.h1 - p.edge1)
         lost = p.spills2 * torch.relu(x.h2 - p.edge2)
@@ -46,14 +46,13 @@ def cascaded_tanks() -> Known:
             "pump": Parameter(0.08, low=0.0, unit="1/s"),
             "lift": Parameter(-0.1, scale=0.05, unit="V/s"),
             "out1": Parameter(0.08, low=0.0),
-            "below1": Parameter(5.0, low=-10.0, scale=3.0, unit="V"),
             "power1": Parameter(0.5, low=0.1, high=1.5),
             "out2": Parameter(0.05, low=0.0),
             "below2": Parameter(-2.0, low=-10.0, scale=2.0, unit="V"),
             "power2": Parameter(0.5, low=0.1, high=1.5),
-            "edge1": Parameter(15.0, low=1.0, scale=4.0, unit="V"),
+            "edge1": Parameter(10.0, low=1.0, scale=2.0, unit="V"),
             "caught": Parameter(0.4, low=0.0, high=2.0),
-            "edge2": Parameter(10.0, low=8.0, high=14.0, scale=1.0, unit="V"),
+            "edge2": Parameter(10.0, low=9.5, high=10.5, unit="V"),
             "spills2": Parameter(0.2, low=0.0, high=1.0, unit="1/s"),
         },
     )

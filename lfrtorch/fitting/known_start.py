@@ -34,7 +34,7 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler, common_unit, rms_scale
 
-_ITERATIONS = 60
+_ITERATIONS = 240
 """Of the first fit, to the parameters alone; there are few of them."""
 
 _STARTS, _SPREAD = 8, 0.5
