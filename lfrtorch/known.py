@@ -101,13 +101,20 @@ class Known:
         states: names, or a :class:`State` each.
         parameters: what a fit finds, by name: a :class:`Parameter`, or a number to start from.
         outputs: y, a tuple. Default: the first states, one for each output of the data.
-        method: how a sample is made of f, with inputs that are held over it: ``"rk4"``, the
-            classical method of Runge and Kutta, ``"euler"``, or ``"discrete"``.
-        substeps: steps of the method in a sample.
+        method: how a sample is made of f: ``"rk4"``, the classical method of Runge and Kutta,
+            ``"euler"``, or ``"discrete"``.
+        substeps: steps of the method in a sample (in half a one with ``"bl"``).
+        intersample: the inputs between samples: ``"zoh"``, held until the next, as a converter
+            does; ``"bl"``, samples of a band-limited signal. That is held from half a sample before
+            to half a sample after each, so states are those half a sample before.
+        sees: what a learned part beside the model is a function of: states by name, and ``"u"`` for
+            the inputs. Default: all.
+        acts_on: states by name, and ``"y"`` for the outputs, that it acts on. Default: all. A speed
+            is the rate of a position for certain: what is unknown acts on the speed alone.
 
     Raises:
-        ValueError: names that are no Python names or stand twice, or, once it meets data, functions
-            that are not made of single numbers and torch's elementary functions.
+        ValueError: names that are no Python names, stand twice or belong to nothing, or, once it
+            meets data, functions that are not of single numbers and torch's elementary functions.
 
     Example:
         >>> def pendulum(x, u, p):
@@ -130,6 +137,9 @@ class Known:
         outputs: Callable[..., Any] | None = None,
         method: Literal["rk4", "euler", "discrete"] = "rk4",
         substeps: int = 1,
+        intersample: Literal["zoh", "bl"] = "zoh",
+        sees: Sequence[str] | None = None,
+        acts_on: Sequence[str] | None = None,
     ) -> None:
         self.f, self.outputs, self.method, self.substeps = f, outputs, method, substeps
         self.states = tuple(s if isinstance(s, State) else State(s) for s in states)
@@ -143,6 +153,11 @@ class Known:
                 f"method is {method!r} and substeps {substeps}; give one of {', '.join(METHODS)}, "
                 "and substeps=1 with 'discrete'."
             )
+        self.centred = intersample == "bl"
+        if self.centred and method == "discrete":
+            raise InputError(
+                "intersample is 'bl', and a discrete model has nothing between samples."
+            )
         if not self.states:
             raise InputError("states is empty; name at least one.")
         try:
@@ -150,6 +165,18 @@ class Known:
             self._p = namedtuple("p", self.parameters)
         except (ValueError, TypeError) as error:
             raise InputError(f"a name of a state or parameter cannot be one: {error}.") from None
+        self.sees, self.acts_on = (
+            self._among("sees", sees, "u"),
+            self._among("acts_on", acts_on, "y"),
+        )
+
+    def _among(self, argument: str, given: Sequence[str] | None, signal: str) -> tuple[str, ...]:
+        """Names of states and of a signal; all if none are given."""
+        names = (*self._x._fields, signal)
+        unknown = [name for name in given or () if name not in names]
+        if unknown or (given is not None and not given):
+            raise InputError(f"{argument} is {given!r}; give some of {', '.join(names)}.")
+        return names if given is None else tuple(given)
 
     def __repr__(self) -> str:
         name = getattr(self.f, "__name__", type(self.f).__name__)
@@ -195,7 +222,8 @@ class Known:
         f, h = traced(self.f, "f", nx), traced(outputs, "outputs", ny)
         names = tuple(self._x._fields), tuple(self.parameters)
         units = tuple(parameter.unit for parameter in self.parameters.values())
-        return KnownEquations(f, h, *names, units, nu, self.method, self.substeps)
+        how = self.method, self.substeps, self.centred
+        return KnownEquations(f, h, *names, units, nu, *how)
 
     def map(self, nu: int, ny: int, fs: float) -> KnownMap:
         """The equations as a static map of an LFR, of signals in physical units, in float64."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lfrtorch.known import Known, Parameter
+from lfrtorch.known import Known, Parameter, State
 
 _EMPTY = 1e-3
 """Least level whose outflow has a slope, V: that of a root is infinite at 0."""
@@ -54,5 +54,38 @@ def cascaded_tanks() -> Known:
             "caught": Parameter(0.4, low=0.0, high=2.0),
             "edge2": Parameter(10.0, low=9.5, high=10.5, unit="V"),
             "spills2": Parameter(0.2, low=0.0, high=1.0, unit="1/s"),
+        },
+    )
+
+
+_STICKS = 5e-4
+"""Speed below which dry friction is no longer whole, m/s."""
+
+
+def emps() -> Known:
+    """The drive of a linear axis: a force moves a mass against viscous and dry friction.
+
+    Per unit of mass, as a position alone does not tell it. The friction is another to each side,
+    which the offset and the slope with the speed describe.
+
+    References:
+        Janot, Gautier and Brunot, "Data set and reference models of EMPS", Workshop on Nonlinear
+        System Identification Benchmarks, 2019.
+    """
+
+    def rates(x, u, p):
+        friction = p.viscous * x.speed + p.dry * torch.tanh(x.speed / _STICKS)
+        return x.speed, p.gain * u[0] - friction - p.offset
+
+    return Known(
+        rates,
+        states=[State("position", unit="m"), State("speed", unit="m/s")],
+        sees=["speed"],
+        acts_on=["speed"],
+        parameters={
+            "gain": Parameter(0.35, low=0.0, unit="m/s² per V"),
+            "viscous": Parameter(2.0, low=0.0, unit="1/s"),
+            "dry": Parameter(0.2, low=0.0, unit="m/s²"),
+            "offset": Parameter(0.0, scale=0.03, unit="m/s²"),
         },
     )

@@ -16,8 +16,8 @@ DISCRETE, EULER, RK4 = range(3)
 
 
 @njit(nogil=True, error_model="numpy")
-def known_step(z, of_z, of_w, p, f, h, nx, method, step, substeps, work, w):
-    """Write w = [x+; y] of z = [x; u].
+def known_step(z, of_z, of_w, p, f, h, nx, method, step, substeps, before, work, w):
+    """Write w = [x+; y] of z = [x; u]; y is that after ``before`` of the substeps.
 
     Shape:
         of_z: (nz, 2) and of_w: (nw, 2), offsets and scales, work: (5, at least nz + p and nw).
@@ -27,15 +27,15 @@ def known_step(z, of_z, of_w, p, f, h, nx, method, step, substeps, work, w):
         v[i] = of_z[i, 0] + of_z[i, 1] * z[i]
     for i in range(len(p)):
         v[len(z) + i] = p[i]
-    h(v.ctypes, found.ctypes)
-    for i in range(nx, len(w)):
-        w[i] = found[i - nx]
     if method == DISCRETE:
+        h(v.ctypes, found.ctypes)
         f(v.ctypes, x.ctypes)
     else:
         for i in range(nx):
             x[i] = v[i]
-        for _ in range(substeps):
+        for n in range(substeps):
+            if n == before:
+                h(v.ctypes, found.ctypes)
             f(v.ctypes, k.ctypes)
             if method == EULER:
                 for i in range(nx):
@@ -54,15 +54,13 @@ def known_step(z, of_z, of_w, p, f, h, nx, method, step, substeps, work, w):
                     x[i] += step / 6.0 * total[i]
             for i in range(nx):
                 v[i] = x[i]
-    for i in range(nx):
-        w[i] = x[i]
     for i in range(len(w)):
-        w[i] = (w[i] - of_w[i, 0]) / of_w[i, 1]
+        w[i] = ((x[i] if i < nx else found[i - nx]) - of_w[i, 0]) / of_w[i, 1]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def known_slopes(
-    r, z, of_z, of_w, p, p_scale, f, h, nx, method, step, substeps, by_z, by_p
+    r, z, of_z, of_w, p, p_scale, f, h, nx, method, step, substeps, before, by_z, by_p
 ):  # fmt: skip
     """Write ∂w/∂z and ∂w/∂p of all samples of record r.
 
@@ -73,7 +71,7 @@ def known_slopes(
     nz, nw = z.shape[1], by_z.shape[1]
     q = nz + len(p)
     v, x = np.empty(q), np.empty(nx)
-    of_f, of_h = np.empty(nx * (1 + q)), np.empty((nw - nx) * (1 + q))
+    of_f, of_h, Y = np.empty(nx * (1 + q)), np.empty((nw - nx) * (1 + q)), np.empty((nw - nx, q))
     S, at, K, total = np.empty((nx, q)), np.empty((nx, q)), np.empty((nx, q)), np.empty((nx, q))
     sum_k = np.empty(nx)
     for i in range(len(p)):
@@ -81,13 +79,14 @@ def known_slopes(
     for t in range(len(z)):
         for i in range(nz):
             v[i] = of_z[i, 0] + of_z[i, 1] * z[t, i]
-        h(v.ctypes, of_h.ctypes)
         for i in range(nx):
             x[i] = v[i]
             for j in range(q):
                 S[i, j] = 1.0 if i == j else 0.0
-        for _ in range(1 if method == DISCRETE else substeps):
-            _rates(f, v, of_f, S, K)
+        for n in range(substeps):
+            if n == before:
+                _chained(h, v, of_h, S, Y)
+            _chained(f, v, of_f, S, K)
             if method != RK4:
                 for i in range(nx):
                     if method == EULER:
@@ -105,7 +104,7 @@ def known_slopes(
                         v[i] = x[i] + part * of_f[i]
                         for j in range(q):
                             at[i, j] = S[i, j] + part * K[i, j]
-                    _rates(f, v, of_f, at, K)
+                    _chained(f, v, of_f, at, K)
                     factor = 1.0 if stage == 3 else 2.0
                     for i in range(nx):
                         sum_k[i] += factor * of_f[i]
@@ -120,7 +119,7 @@ def known_slopes(
                     v[i] = x[i]
         for i in range(nw):
             for j in range(q):
-                slope = S[i, j] if i < nx else of_h[nw - nx + (i - nx) * q + j]
+                slope = S[i, j] if i < nx else Y[i - nx, j]
                 if j < nz:
                     by_z[t, i, j] = slope * of_z[j, 1] / of_w[i, 1]
                 else:
@@ -128,12 +127,12 @@ def known_slopes(
 
 
 @njit(nogil=True, error_model="numpy")
-def _rates(f, v, of_f, S, K):
+def _chained(f, v, of_f, S, K):
     """Evaluate f at v, and K = Fx S + [0 Fu Fp]."""
     f(v.ctypes, of_f.ctypes)
     nx, q = S.shape
-    for i in range(nx):
-        row = nx + i * q
+    for i in range(len(K)):
+        row = len(K) + i * q
         for j in range(q):
             a = of_f[row + j] if j >= nx else 0.0
             for n in range(nx):
@@ -144,7 +143,7 @@ def _rates(f, v, of_f, S, K):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def simulate_known_record(
     r, u, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth,
-    of_z, of_w, p, f, h, n_states, method, step, substeps, met_within, x, z, w, y,
+    of_z, of_w, p, f, h, n_states, method, step, substeps, before, met_within, x, z, w, y,
 ):  # fmt: skip
     """Simulate record r of a static map that is a known model and then a network or polynomial.
 
@@ -158,7 +157,9 @@ def simulate_known_record(
         affine(Cz, x[k], Dzu, u[k], z[k])
         for i in range(first):
             known_z[i] = z[k, i]
-        known_step(known_z, of_z, of_w, p, f, h, n_states, method, step, substeps, work, known_w)
+        known_step(
+            known_z, of_z, of_w, p, f, h, n_states, method, step, substeps, before, work, known_w
+        )
         for i in range(last):
             w[k, i] = known_w[i]
         if len(Ww):

@@ -33,7 +33,9 @@ class KnownEquations(NamedTuple):
         units: of the parameters.
         inputs: number of u.
         method: one of ``METHODS``.
-        substeps: steps of the integration in a sample.
+        substeps: steps of the integration in a sample, or in half a one with ``centred``.
+        centred: whether inputs are held from half a sample before to half a sample after their
+            own; x is then the state half a sample before.
     """
 
     f: Formula
@@ -44,6 +46,7 @@ class KnownEquations(NamedTuple):
     inputs: int
     method: str
     substeps: int
+    centred: bool = False
 
     def described(self) -> dict[str, Any]:
         """The equations for JSON."""
@@ -61,7 +64,8 @@ class KnownEquations(NamedTuple):
         fits = f.inputs == h.inputs == size and len(f.results) == len(states) and substeps > 0
         if not fits or description["method"] not in METHODS:
             raise InputError("its known equations do not fit each other")
-        return cls(f, h, states, names, units, inputs, description["method"], substeps)
+        how = description["method"], substeps, bool(description["centred"])
+        return cls(f, h, states, names, units, inputs, *how)
 
 
 class KnownMap(Module):
@@ -116,9 +120,11 @@ class KnownMap(Module):
         return dict(zip(self.equations.parameters, values, strict=True))
 
     @property
-    def step(self) -> float:
-        """Seconds of one step of the integration."""
-        return self.sample_time / self.equations.substeps
+    def steps(self) -> tuple[float, int, int]:
+        """Seconds of one step of the integration, their number, and those before the output."""
+        e = self.equations
+        number = e.substeps * (1 + e.centred)
+        return self.sample_time / number, number, e.substeps * e.centred
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
         """w of z."""
@@ -130,12 +136,13 @@ class KnownMap(Module):
         def of(formula: Formula, x: Tensor) -> Tensor:
             return torch.stack(formula(*x.unbind(-1), *u, *parameters), -1)
 
-        f, h, step = self.equations.f, self.equations.h, self.step
-        y = of(h, x)
+        f, h, (step, number, before) = self.equations.f, self.equations.h, self.steps
+        y = x
         if self.equations.method == "discrete":
-            x = of(f, x)
+            y, x = of(h, x), of(f, x)
         else:
-            for _ in range(self.equations.substeps):
+            for n in range(number):
+                y = of(h, x) if n == before else y
                 k1 = of(f, x)
                 if self.equations.method == "euler":
                     x = x + step * k1
@@ -150,7 +157,7 @@ class KnownMap(Module):
         """The map as ``known_kernel`` takes it, between p and w; ``slopes``: with derivatives."""
         e = self.equations
         f, h = (machine_code(each, slopes=slopes) for each in (e.f, e.h))
-        return [f, h, self.nx, METHODS[e.method], self.step, e.substeps]
+        return [f, h, self.nx, METHODS[e.method], *self.steps]
 
     def arguments(self, p: Tensor | None = None) -> list[Any]:
         """Scaling and physical parameters as ``known_kernel`` takes them."""

@@ -61,7 +61,7 @@ def known_model(known: Known, linear: LinearModel, records: Sequence[Record]) ->
             (static.of_w, nx, scaler.y_offset, scaler.y_scale),
         ):
             ends[place:] = torch.as_tensor(np.stack([offset, scale], axis=1))
-    cell = around(static, nx, nu, ny)
+    cell = around(static, known, nu, ny)
     model = Model(LFR(cell), scaler, first.fs, first.inputs, first.outputs)
     x = torch.cat([model.signals(record).x[0] for record in records])
     rms = x.square().mean(dim=0).sqrt()
@@ -74,7 +74,7 @@ def known_model(known: Known, linear: LinearModel, records: Sequence[Record]) ->
 
 def around(
     static: KnownMap,
-    nx: int,
+    known: Known,
     nu: int,
     ny: int,
     *,
@@ -84,7 +84,7 @@ def around(
     states: int = 0,
 ) -> LFRCell:
     """The cell around a known model and, beside it, a learned map and learned states; all at 0."""
-    whole = static
+    whole, nx, names = static, len(known.states), [state.name for state in known.states]
     if learned is not None:
         whole = DirectSum([static, learned], [(static.nz, static.nw), (nz, nw)])
     sizes = nu, ny, nx + states, static.nz + nz, static.nw + nw
@@ -94,12 +94,22 @@ def around(
         cell.Bw[:nx, :nx], cell.Dyw[:, nx : nx + ny] = torch.eye(nx), torch.eye(ny)
     x, z, w = (torch.arange(n) for n in (nx + states, static.nz + nz, static.nw + nw))
     own_x, own_z, own_w = x < nx, z < static.nz, w < static.nw
+
+    def not_among(some: Sequence[str]) -> Tensor:  # known states that are not
+        return torch.tensor([n not in some for n in names] + [False] * states, dtype=torch.bool)
+
+    unseen, alone = not_among(known.sees), not_among(known.acts_on)
+    u_unseen, y_alone = "u" not in known.sees, "y" not in known.acts_on
     given = {
-        "A": own_x[:, None] & own_x, "Bu": own_x[:, None].expand(-1, nu),
-        "Bw": own_w.expand(len(x), -1), "Cz": own_z[:, None].expand(-1, len(x)),
-        "Dzu": own_z[:, None].expand(-1, nu), "Cy": own_x.expand(ny, -1),
-        "Dyu": torch.ones(ny, nu, dtype=torch.bool), "Dyw": own_w.expand(ny, -1),
-    }  # fmt: skip
+        "A": (own_x[:, None] & own_x) | unseen | alone[:, None],
+        "Bu": (own_x | u_unseen)[:, None].expand(-1, nu),
+        "Bw": own_w | alone[:, None],
+        "Cz": own_z[:, None] | unseen,
+        "Dzu": (own_z | u_unseen)[:, None].expand(-1, nu),
+        "Cy": (own_x | y_alone).expand(ny, -1),
+        "Dyu": torch.ones(ny, nu, dtype=torch.bool),
+        "Dyw": (own_w | y_alone).expand(ny, -1),
+    }
     for name, mask in given.items():
         cell.fix(name, mask.clone())
     return cell
@@ -110,14 +120,16 @@ def with_learned(model: Model, records: Sequence[Record], settings: Settings, se
     parts = known_parts(model.lfr.cell.static)
     assert parts is not None
     static, old = deepcopy(parts[0]), model.lfr.cell
-    nx, states = old.nx, cast(int, settings.nx)
+    known, nx, states = cast(Known, settings.known), old.nx, cast(int, settings.nx)
     generator = torch.Generator().manual_seed(seed)
     learned = learned_map(settings, generator)
     nz, nw = (0, 0) if learned is None else (cast(int, settings.nz), cast(int, settings.nw))
-    cell = around(static, nx, old.nu, old.ny, learned=learned, nz=nz, nw=nw, states=states)
+    cell = around(static, known, old.nu, old.ny, learned=learned, nz=nz, nw=nw, states=states)
 
-    def uniform(entries: Tensor, limit: float = 1.0) -> None:
+    def uniform(name: str, part: Any, limit: float = 1.0) -> None:
+        entries = cell.get_parameter(name)[part]
         entries.uniform_(-limit, limit, generator=generator)
+        entries.masked_fill_(cell.fixed[name][part], 0.0)
 
     with torch.no_grad():
         found = [model.signals(record) for record in records]
@@ -127,19 +139,19 @@ def with_learned(model: Model, records: Sequence[Record], settings: Settings, se
             corners = relaxation_frequencies([record.u for record in records], states)
             decay = torch.as_tensor(np.exp(-corners))
             cell.A[nx:, nx:] = torch.diag(decay)
-            uniform(cell.Bu[nx:])
+            uniform("Bu", slice(nx, None))
             cell.Bu[nx:] *= (1.0 - decay.square()).sqrt()[:, None]
         if learned is not None:
             own_z, own_w = slice(static.nz, None), slice(static.nw, None)
-            uniform(cell.Cz[own_z])
-            uniform(cell.Dzu[own_z])
+            uniform("Cz", own_z)
+            uniform("Dzu", own_z)
             z = x @ cell.Cz[own_z, :nx].mT + u @ cell.Dzu[own_z].mT
             rms = z.square().mean(dim=0).sqrt().clamp_min(1e-6)
             rms = torch.where(torch.isfinite(rms), rms, 1.0)
             cell.Cz[own_z] /= rms[:, None]
             cell.Dzu[own_z] /= rms[:, None]
-            uniform(cell.Bw[:, own_w], _REACH)
-            uniform(cell.Dyw[:, own_w], _REACH)
+            uniform("Bw", (slice(None), own_w), _REACH)
+            uniform("Dyw", (slice(None), own_w), _REACH)
             for name in ("Ww", "bw") if isinstance(learned, Network) else ("C",):
                 learned.get_parameter(name).zero_()
     return replace(model, lfr=LFR(cell))

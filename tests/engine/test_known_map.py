@@ -16,7 +16,7 @@ from lfrtorch.engine.static_jacobian import ModuleJacobian
 
 pytestmark = pytest.mark.numeric
 
-METHODS = ["rk4", "euler", "discrete"]
+METHODS = ["rk4", "euler", "discrete", "rk4 centred", "euler centred"]
 
 
 def rates(h1, h2, u, a, b, k):
@@ -36,7 +36,8 @@ def known_map(method: str) -> KnownMap:
     h = Formula.traced(lambda h1, h2, u, a, b, k: [h2 + 0.1 * a * u], 6)
     substeps = 1 if method == "discrete" else 3
     names = ("h1", "h2"), ("a", "b", "k"), ("", "", "1/s")
-    equations = KnownEquations(f, h, *names, 1, method, substeps)
+    how, centred = method.split(maxsplit=1)[0], method.endswith("centred")
+    equations = KnownEquations(f, h, *names, 1, how, substeps, centred)
     found = KnownMap(equations, 0.2, dtype=torch.float64)
     with torch.no_grad():
         found.p_scale.copy_(torch.tensor([0.3, 0.2, 0.4]))
@@ -126,3 +127,20 @@ def test_equations_survive_a_description():
 
 def replace_states(equations: KnownEquations):
     return equations._replace(states=("h1",)).described()
+
+
+def test_a_centred_hold_is_that_of_the_middle_of_samples():
+    # A held sine's first harmonic, against the response to the sine itself: no delay is left.
+    f, h = Formula.traced(lambda x, u: [u - x], 2), Formula.traced(lambda x, u: [x], 2)
+    t = 0.2 * torch.arange(400, dtype=torch.float64)
+    u, errors = torch.sin(t)[None, :, None], []
+    steady = 0.5 * (torch.sin(t) - torch.cos(t))
+    for centred in (False, True):
+        equations = KnownEquations(f, h, ("x",), (), (), 1, "rk4", 1, centred)
+        cell = LFRCell(1, 1, 1, 2, 2, KnownMap(equations, 0.2, dtype=torch.float64)).double()
+        with torch.no_grad():
+            cell.Cz[0], cell.Dzu[1], cell.Bw[0, 0], cell.Dyw[0, 1] = 1.0, 1.0, 1.0, 1.0
+        y = simulation.simulate(cell, u, torch.zeros(1, 1, dtype=torch.float64)).y[0, :, 0]
+        errors.append(float((y - steady)[200:].abs().max()))
+    assert errors[0] > 0.05
+    assert errors[1] < 0.003
