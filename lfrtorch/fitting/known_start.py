@@ -30,6 +30,7 @@ from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Stage
 from lfrtorch.fitting.trainer import StoppedError
 from lfrtorch.known import Known
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler, common_unit, rms_scale
@@ -185,26 +186,26 @@ def varied(model: Model, seed: int) -> Model:
 
 
 def known_starts(stage: Stage, linear: LinearModel) -> tuple[Settings, list[Model]]:
-    """The settings with the number of starts, and their models."""
+    """The settings with the number of starts, and their models.
+
+    The parameters are fitted first, without a ridge: that keeps what is learned afterwards near.
+    """
     dataset, settings, observer = stage.dataset, stage.settings, stage.observer
-    known, trainer = cast(Known, settings.known), cast(Any, settings.trainer)
+    known = cast(Known, settings.known)
     model = known_model(known, linear, dataset.train)
+    grey = settings.nn == 0 and not settings.nx and settings.static == "network"
     count = _STARTS if settings.starts == "auto" else settings.starts
-    settings = replace(settings, starts=count)
-    seeds = settings.seeds
-    if settings.nn == 0 and not settings.nx and settings.static == "network":
-        return settings, [model, *(varied(model, seed) for seed in seeds[1:])]
     if known.parameters:
         options: Any = {**stage.options, "ridge": 0.0}
-        options["trainer"] = replace(trainer, max_iter=_ITERATIONS)
+        options["trainer"] = LevenbergMarquardt(max_iter=_ITERATIONS)
         monitor = observer.searching()
-        begun = [model, *(varied(model, settings.seed + n) for n in range(1, _STARTS))]
+        begun = count if grey else _STARTS
         result = fit(
-            begun,
+            [model, *(varied(model, settings.seed + n) for n in range(1, begun))],
             dataset.train,
             dataset.validation,
             dataset.selection,
-            monitors=None if monitor is None else [[monitor]] * len(begun),
+            monitors=None if monitor is None else [[monitor]] * begun,
             **options,
         )
         if result.reason in CUT_SHORT:
@@ -217,7 +218,10 @@ def known_starts(stage: Stage, linear: LinearModel) -> tuple[Settings, list[Mode
             f"training, {quantity(result.seconds, 's')}"
         )
     model.lfr.to(device=settings.device, dtype=settings.dtype)
-    return settings, [with_learned(model, dataset.train, settings, seed) for seed in seeds]
+    if grey:
+        return replace(settings, starts=1, ridge=0.0), [model]
+    settings = replace(settings, starts=count)
+    return settings, [with_learned(model, dataset.train, settings, n) for n in settings.seeds]
 
 
 def physical(model: Model) -> dict[str, float]:
