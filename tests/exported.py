@@ -10,10 +10,12 @@ import torch
 from reference import measure, normal, polynomial_cell, random_cell, random_model
 from torch.func import jacrev
 
-from lfrtorch import NoiseCovariance
+from lfrtorch import Known, LFRCell, Network, NoiseCovariance
 from lfrtorch._support.types import Array
 from lfrtorch.analysis import canonical
 from lfrtorch.engine.activations import ACTIVATIONS
+from lfrtorch.engine.cell import Matrices
+from lfrtorch.engine.direct_sum import DirectSum
 from lfrtorch.model import Model
 
 Step = Callable[[Array, Array], tuple[Array, Array]]
@@ -25,15 +27,49 @@ def in_canonical_form(model: Model) -> Model:
     return canonical(model, measure(model, 60, seed=1)).model
 
 
+def known_model() -> Model:
+    """Two tanks with an overflow, a network of each activation of the table beside it, a state."""
+
+    def rates(x, u, p):
+        def drain(level):
+            return p.out * torch.sqrt((level + 1.0).clamp(min=1e-2))
+
+        over = torch.nn.functional.softplus(x.h1 - 1.5) + torch.relu(x.h1 - x.h2)
+        pump = torch.where(u[0] > u[1], torch.sin(u[0]) ** 2, torch.sigmoid(u[1]))
+        lost = torch.minimum(x.h2, p.edge) * torch.exp(-torch.abs(x.h2))
+        return pump - drain(x.h1) - 0.1 * over, drain(x.h1) - p.out * lost - 0.1 * x.h2
+
+    def outputs(x, u, p):
+        return x.h2 + 0.1 * torch.tanh(u[0]), torch.cos(x.h1) - p.edge, u[1] * 0.5
+
+    known = Known(
+        rates, states=["h1", "h2"], parameters={"out": 0.4, "edge": 0.7}, outputs=outputs,
+        substeps=2, intersample="bl",
+    )  # fmt: skip
+    own = known.map(2, 3, 4.0)
+    network = Network(2, 1, 4, "softplus", dtype=torch.float64)
+    static = DirectSum([own, network], [(own.nz, own.nw), (2, 1)])
+    cell = LFRCell(2, 3, 3, own.nz + 2, own.nw + 1, static, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        network.reset_parameters(generator)
+        for name in Matrices._fields:
+            cell.get_parameter(name).uniform_(-0.1, 0.1, generator=generator)
+        cell.Cz[:2, :2], cell.Dzu[2:4] = torch.eye(2), torch.eye(2)
+        cell.Bw[:2, :2], cell.Dyw[:, 2:5] = 0.8 * torch.eye(2), torch.eye(3)
+    return random_model(cell)
+
+
 MODELS: dict[str, Model] = {
     **{name: random_model(random_cell(2, 3, 4, 2, 3, 5, activation=name)) for name in ACTIVATIONS},
     "polynomial": random_model(polynomial_cell(2, 2, 3)),
     "affine": random_model(polynomial_cell(1, 1, 1)),
     "linear": random_model(random_cell(2, 2, 3, 0, 0)),
     "canonical": in_canonical_form(random_model(random_cell(2, 3, 4, 2, 3, 5))),
+    "known": known_model(),
     "smallest": random_model(random_cell(1, 1, 1, 1, 1, 1), fs=750.0),
 }
-"""Every activation, polynomials, no static map, a canonical form, one of all."""
+"""Every activation, polynomials, no static map, a canonical form, a known model, one of all."""
 
 
 OBSERVED: dict[str, Model] = {

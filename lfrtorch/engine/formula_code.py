@@ -1,67 +1,119 @@
-"""Formulas as sympy's expressions, with their derivatives, and as machine code."""
+"""Formulas with their derivatives, as the text of a language, and as machine code."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
-from lfrtorch.engine.operations import Formula
+import torch
 
+from lfrtorch.engine.operations import Formula, Operation, Symbol
 
-class Code(NamedTuple):
-    """Assignments in order: of temporaries, by name, and of results."""
+PYTHON = {
+    "add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}",
+    "pow": "{0} ** {1}", "sigmoid": "1.0 / (1.0 + math.exp(-{0}))", "abs": "abs({0})",
+    "relu": "{0} if {0} > 0.0 else 0.0", "where": "{1} if {0} else {2}",
+    "softplus": "({0} if {0} > 0.0 else 0.0) + math.log(1.0 + math.exp(-abs({0})))",
+    "sign": "1.0 if {0} > 0.0 else (-1.0 if {0} < 0.0 else 0.0)",
+    "maximum": "{0} if {0} >= {1} else {1}", "minimum": "{0} if {0} <= {1} else {1}",
+    "lt": "{0} < {1}", "le": "{0} <= {1}", "gt": "{0} > {1}", "ge": "{0} >= {1}",
+    "and": "{0} and {1}", "or": "{0} or {1}", "not": "not {0}", "atan2": "math.atan2({0}, {1})",
+} | {
+    name: f"math.{name}({{0}})" for name in (
+        "sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"
+    )
+}  # fmt: skip
+"""Operations in Python, of operands that are names or numbers in brackets."""
 
-    temporaries: list[tuple[Any, Any]]
-    results: list[Any]
-
-
-def expressions(formula: Formula, inputs: Sequence[Any]) -> list[Any]:
-    """The results as expressions of sympy in symbols for the inputs."""
-    import sympy
-
-    def choice(condition: Any, yes: Any, no: Any) -> Any:
-        return sympy.Piecewise((yes, condition), (no, True))
-
-    def softplus(v: Any) -> Any:
-        return choice(v > 0, v, 0.0) + sympy.log(1 + sympy.exp(-sympy.Abs(v)))
-
-    same = "sqrt exp log sin cos tan asin acos atan atan2 sinh cosh tanh"
-    operations: dict[str, Callable[..., Any]] = {n: getattr(sympy, n) for n in same.split()}
-    operations |= {
-        "add": lambda a, b: a + b, "sub": lambda a, b: a - b, "mul": lambda a, b: a * b,
-        "div": lambda a, b: a / b, "neg": lambda a: -a, "pow": lambda a, b: a**b,
-        "sigmoid": lambda v: 1 / (1 + sympy.exp(-v)), "softplus": softplus, "abs": sympy.Abs,
-        "relu": lambda v: choice(v > 0, v, 0.0), "where": choice,
-        "sign": lambda v: sympy.Piecewise((1, v > 0), (-1, v < 0), (0, True)),
-        "maximum": lambda a, b: choice(a >= b, a, b), "minimum": lambda a, b: choice(a <= b, a, b),
-        "lt": sympy.Lt, "le": sympy.Le, "gt": sympy.Gt, "ge": sympy.Ge,
-        "and": sympy.And, "or": sympy.Or, "not": sympy.Not,
-    }  # fmt: skip
-
-    def constant(value: float) -> Any:
-        return sympy.Integer(int(value)) if value.is_integer() else sympy.Float(value, 17)
-
-    return formula.evaluated(inputs, operations, constant)
+SLOPES: dict[str, Callable[..., tuple[Any, ...]]] = {
+    "add": lambda w, a, b: (1.0, 1.0), "sub": lambda w, a, b: (1.0, -1.0),
+    "mul": lambda w, a, b: (b, a), "div": lambda w, a, b: (1.0 / b, -w / b),
+    "neg": lambda w, a: (-1.0,), "pow": lambda w, a, b: (b * a ** (b - 1.0), w * torch.log(a)),
+    "sqrt": lambda w, a: (0.5 / w,), "exp": lambda w, a: (w,), "log": lambda w, a: (1.0 / a,),
+    "sin": lambda w, a: (torch.cos(a),), "cos": lambda w, a: (-torch.sin(a),),
+    "tan": lambda w, a: (1.0 + w * w,), "asin": lambda w, a: (1.0 / torch.sqrt(1.0 - a * a),),
+    "acos": lambda w, a: (-1.0 / torch.sqrt(1.0 - a * a),),
+    "atan": lambda w, a: (1.0 / (1.0 + a * a),),
+    "atan2": lambda w, a, b: (b / (a * a + b * b), -a / (a * a + b * b)),
+    "sinh": lambda w, a: (torch.cosh(a),), "cosh": lambda w, a: (torch.sinh(a),),
+    "tanh": lambda w, a: (1.0 - w * w,), "sigmoid": lambda w, a: (w * (1.0 - w),),
+    "relu": lambda w, a: (torch.where(a > 0.0, 1.0, 0.0),),
+    "softplus": lambda w, a: (torch.sigmoid(a),), "abs": lambda w, a: (torch.sign(a),),
+    "maximum": lambda w, a, b: (torch.where(a >= b, 1.0, 0.0), torch.where(a >= b, 0.0, 1.0)),
+    "minimum": lambda w, a, b: (torch.where(a <= b, 1.0, 0.0), torch.where(a <= b, 0.0, 1.0)),
+}  # fmt: skip
+"""Partial derivatives from the result and the operands; of other operations they are 0."""
 
 
 @lru_cache(maxsize=32)
-def code(formula: Formula, *, slopes: bool = False) -> Code:
-    """The results, and with ``slopes`` their derivatives by all inputs, row by row, as assignments.
+def with_slopes(formula: Formula) -> Formula:
+    """The results and after them their derivatives by all inputs, row by row.
 
-    The inputs are the symbols v0, v1, ...
+    At an edge, as of an absolute value, the derivative is that of one side or 0.
     """
-    import sympy
+    table = [*formula.rows]
+    tangents: list[dict[int, Any]] = []  # of each row: its derivatives that are not 0, by input
 
-    v = sympy.symbols(f"v:{formula.inputs}", real=True)
-    found = [sympy.sympify(each) for each in expressions(formula, v)]
-    if slopes:
-        found += [each.diff(by) for each in found for by in v]
-    # A derivative at a point where there is none counts as 0.
-    found = [each.replace(sympy.DiracDelta, lambda *_: sympy.Integer(0)) for each in found]
-    temporaries, results = sympy.cse(found, symbols=sympy.numbered_symbols("t"), list=True)
-    return Code(temporaries, list(results))
+    def symbol(row: int) -> Symbol:
+        return Symbol(table, row)
+
+    def is_one(value: Any) -> bool:
+        return isinstance(value, float) and value == 1.0
+
+    def product(a: Any, b: Any) -> Any:
+        return b if is_one(a) else a if is_one(b) else a * b
+
+    for number, row in enumerate(formula.rows):
+        found: dict[int, Any] = {}
+        if row.name == "input":
+            found[int(row.number)] = 1.0
+        elif row.name == "where":
+            condition, *sides = row.operands
+            for j in tangents[sides[0]] | tangents[sides[1]]:
+                yes, no = (tangents[side].get(j, 0.0) for side in sides)
+                found[j] = torch.where(symbol(condition), yes, no)  # pyright: ignore
+        elif row.name in SLOPES and any(tangents[place] for place in row.operands):
+            partials = SLOPES[row.name](symbol(number), *map(symbol, row.operands))
+            for place, partial in zip(row.operands, partials, strict=True):
+                for j, tangent in tangents[place].items():
+                    term = product(partial, tangent)
+                    found[j] = found[j] + term if j in found else term
+        tangents.append(found)
+    results = [*formula.results]
+    for row in formula.results:
+        for j in range(formula.inputs):
+            slope = tangents[row].get(j, 0.0)
+            if not isinstance(slope, Symbol):
+                table.append(Operation("constant", number=slope))
+                slope = symbol(len(table) - 1)
+            results.append(slope.row)
+    return Formula(formula.inputs, tuple(table), tuple(results)).pruned()
+
+
+def statements(
+    formula: Formula, inputs: Sequence[str], texts: Mapping[str, str]
+) -> tuple[list[tuple[str, str]], list[str]]:
+    """Names and expressions of temporaries in order, and the results, in the texts of a language.
+
+    Args:
+        formula: what is written.
+        inputs: how the language says each input.
+        texts: how it says each operation.
+    """
+    names: list[str] = []
+    made: list[tuple[str, str]] = []
+    for row in formula.rows:
+        if row.name == "input":
+            names.append(inputs[int(row.number)])
+        elif row.name == "constant":
+            names.append(repr(row.number) if row.number >= 0 else f"({row.number!r})")
+        else:
+            expression = texts[row.name].format(*(names[i] for i in row.operands))
+            made.append((f"t{len(made)}", expression))
+            names.append(made[-1][0])
+    return made, [names[i] for i in formula.results]
 
 
 @lru_cache(maxsize=32)
@@ -71,12 +123,11 @@ def machine_code(formula: Formula, *, slopes: bool = False) -> Any:
     Kernels take it as an argument, and are compiled once for all of them.
     """
     from numba import cfunc, types
-    from sympy import pycode
 
-    made = code(formula, slopes=slopes)
-    lines = [f"v{i} = v[{i}]" for i in range(formula.inputs)]
-    lines += [f"{name} = {pycode(value)}" for name, value in made.temporaries]
-    lines += [f"out[{i}] = {pycode(value)}" for i, value in enumerate(made.results)]
+    formula = with_slopes(formula) if slopes else formula
+    made, results = statements(formula, [f"v[{i}]" for i in range(formula.inputs)], PYTHON)
+    lines = [f"{name} = {expression}" for name, expression in made]
+    lines += [f"out[{i}] = {result}" for i, result in enumerate(results)]
     source = "def function(v, out):\n    " + "\n    ".join(lines) + "\n"
     known: dict[str, Any] = {"math": math}
     exec(compile(source, "<formula>", "exec"), known)  # of operations of the table alone

@@ -6,6 +6,7 @@ In an LFR with fixed matrices this is the known model itself; beside it, the LFR
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -17,7 +18,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.threads import has_kernels, spread, to_numpy
 from lfrtorch.engine.formula_code import machine_code
 from lfrtorch.engine.known_kernel import DISCRETE, EULER, RK4, known_slopes
-from lfrtorch.engine.operations import Formula
+from lfrtorch.engine.operations import Formula, Symbol
 from lfrtorch.engine.static_jacobian import ModuleJacobian, StaticJacobian, Weights
 
 METHODS = {"discrete": DISCRETE, "euler": EULER, "rk4": RK4}
@@ -128,30 +129,50 @@ class KnownMap(Module):
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
         """w of z."""
-        v = self.of_z[:, 0] + self.of_z[:, 1] * z
-        signals, p = v.unbind(-1), (self.p * self.p_scale).unbind(-1)
-        x, u = torch.stack(signals[: self.nx], -1), signals[self.nx :]
-        parameters = [each.expand(z.shape[:-1]) for each in p]
+        v = (self.of_z[:, 0] + self.of_z[:, 1] * z).unbind(-1)
+        p = [each.expand(z.shape[:-1]) for each in (self.p * self.p_scale).unbind(-1)]
+        w = self._stepped(v, p, lambda formula, values: formula(*values))
+        return (torch.stack(w, -1) - self.of_w[:, 0]) / self.of_w[:, 1]
 
-        def of(formula: Formula, x: Tensor) -> Tensor:
-            return torch.stack(formula(*x.unbind(-1), *u, *parameters), -1)
+    def of_symbols(self, z: Sequence[Symbol]) -> list[Any]:
+        """w of z for a table of operations, with the parameters as numbers."""
+        ends = (self.of_z, self.of_w)
+        of_z, of_w = (each.detach().double().cpu().tolist() for each in ends)
+        v = [offset + scale * each for each, (offset, scale) in zip(z, of_z, strict=True)]
+        p = [z[0].constant(value) for value in self.physical.values()]
+        w = self._stepped(v, p, lambda formula, values: formula.of_symbols(values))
+        return [(each - offset) / scale for each, (offset, scale) in zip(w, of_w, strict=True)]
 
+    def _stepped(
+        self, v: Sequence[Any], p: Sequence[Any], of: Callable[[Formula, Sequence[Any]], list[Any]]
+    ) -> list[Any]:
+        """[x+; y] of v = [x; u] and p in physical units; ``of`` evaluates a formula."""
+        x, u = [*v[: self.nx]], [*v[self.nx :]]
         f, h, (step, number, before) = self.equations.f, self.equations.h, self.steps
-        y = x
         if self.equations.method == "discrete":
-            y, x = of(h, x), of(f, x)
-        else:
-            for n in range(number):
-                y = of(h, x) if n == before else y
-                k1 = of(f, x)
-                if self.equations.method == "euler":
-                    x = x + step * k1
-                    continue
-                k2 = of(f, x + 0.5 * step * k1)
-                k3 = of(f, x + 0.5 * step * k2)
-                k4 = of(f, x + step * k3)
-                x = x + step / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
-        return (torch.cat([x, y], -1) - self.of_w[:, 0]) / self.of_w[:, 1]
+            return [*of(f, [*x, *u, *p]), *of(h, [*x, *u, *p])]
+
+        def rates(*terms: tuple[float, list[Any]]) -> list[Any]:
+            return of(f, [*moved(*terms), *u, *p])
+
+        def moved(*terms: tuple[float, list[Any]]) -> list[Any]:
+            found = x
+            for part, k in terms:
+                found = [a + part * b for a, b in zip(found, k, strict=True)]
+            return found
+
+        y: list[Any] = []
+        for n in range(number):
+            y = of(h, [*x, *u, *p]) if n == before else y
+            k1 = rates()
+            if self.equations.method == "euler":
+                x = moved((step, k1))
+                continue
+            k2 = rates((0.5 * step, k1))
+            k3 = rates((0.5 * step, k2))
+            k4 = rates((step, k3))
+            x = moved((step / 6.0, k1), (step / 3.0, k2), (step / 3.0, k3), (step / 6.0, k4))
+        return [*x, *y]
 
     def kernel(self, *, slopes: bool = False) -> list[Any]:
         """The map as ``known_kernel`` takes it, between p and w; ``slopes``: with derivatives."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import combinations_with_replacement
-from typing import NamedTuple, TypeGuard
+from typing import Any, NamedTuple, TypeGuard, cast
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from lfrtorch._support.types import Integers
 from lfrtorch.engine.activations import ACTIVATIONS, Activation
 from lfrtorch.engine.direct_sum import DirectSum, DirectSumJacobian
 from lfrtorch.engine.known_map import KnownMap
+from lfrtorch.engine.operations import Formula, Symbol
 from lfrtorch.engine.static_jacobian import (
     ModuleJacobian,
     NetworkJacobian,
@@ -122,6 +124,18 @@ class Network(Module):
         """The map for compiled code."""
         return Kernel(self.Wz.mT, self.Ww, self.bz, self.bw, self.sigma.code)
 
+    def of_symbols(self, z: Sequence[Symbol]) -> list[Any]:
+        """w of z for a table of operations."""
+        Wz, bz, Ww, bw = (
+            weight.detach().double().cpu().tolist()
+            for weight in (self.Wz, self.bz, self.Ww, self.bw)
+        )
+        sigma: Any = self.sigma.value
+        if self.activation == "softplus":
+            sigma = torch.nn.functional.softplus
+        h = [sigma(_combined(row, z, constant)) for row, constant in zip(Wz, bz, strict=True)]
+        return [_combined(row, h, constant) for row, constant in zip(Ww, bw, strict=True)]
+
     def linearised(self, z: Float[Tensor, "R T nz"], weights: Weights) -> StaticJacobian:
         """The map linearised at z, with the given weights."""
         return NetworkJacobian(self.sigma, z, weights)
@@ -216,6 +230,13 @@ class Polynomial(Module):
         """The map for compiled code."""
         zeros, nw = self.C.new_zeros, self.C.shape[-2]
         return Kernel(zeros(0, 0), self.C, zeros(0), zeros(nw), growth=np.array(self.growth))
+
+    def of_symbols(self, z: Sequence[Symbol]) -> list[Any]:
+        """w of z for a table of operations."""
+        m: list[Any] = [z[0].constant(1.0)]
+        for before, j in self.growth:
+            m.append(m[before] * z[j] if before else z[j])
+        return [_combined(row, m) for row in self.C.detach().double().cpu().tolist()]
 
     def linearised(self, z: Float[Tensor, "R T nz"], weights: Weights) -> StaticJacobian:
         """The map linearised at z, with the given weights."""
@@ -339,3 +360,26 @@ def known_parts(static: Module | None) -> tuple[KnownMap, Network | Polynomial |
         if isinstance(first, KnownMap) and learned is not None:
             return first, learned
     return None
+
+
+def formula_of(static: Module) -> Formula:
+    """z -> w of a known model and what is learned beside it, as one table of operations."""
+    if not isinstance(static, DirectSum):
+        return Formula.traced(lambda *z: cast(KnownMap, static).of_symbols(z), cast(Any, static).nz)
+
+    def written(*z: Symbol) -> list[Any]:
+        w, first = [], 0
+        for part, (size, _) in zip(static.parts, static.sizes_of_parts, strict=True):
+            w += cast(KnownMap | Network | Polynomial, part).of_symbols(z[first : first + size])
+            first += size
+        return w
+
+    return Formula.traced(written, sum(size for size, _ in static.sizes_of_parts))
+
+
+def _combined(weights: list[float], signals: Sequence[Any], constant: float = 0.0) -> Any:
+    """A sum of weighted symbols and a constant."""
+    total = signals[0].constant(constant)
+    for weight, signal in zip(weights, signals, strict=True):
+        total = total + weight * signal
+    return total

@@ -1,4 +1,4 @@
-"""Functions of scalars as tables of operations: traced once, and computed by torch, sympy, kernels.
+"""Functions of scalars as tables of operations, which torch, kernels and exports compute.
 
 A function that is written with torch's functions is called once with symbols in the place of
 numbers, and what it does to them is written down, one operation a row. So a checkpoint holds the
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -66,7 +67,7 @@ def _operator(name: str, *, swapped: bool = False) -> Callable[..., Symbol]:
     """A method that writes an operation down."""
 
     def method(self: Symbol, *others: Any) -> Symbol:
-        return _row(self._table, name, (*others, self) if swapped else (self, *others))
+        return _row(self.table, name, (*others, self) if swapped else (self, *others))
 
     return method
 
@@ -75,20 +76,20 @@ class Symbol:
     """A scalar in a function that is traced; everything that is done with it becomes a row."""
 
     def __init__(self, table: list[Operation], row: int) -> None:
-        self._table, self._row = table, row
+        self.table, self.row = table, row
 
     @classmethod
     def __torch_function__(
         cls, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
     ) -> Symbol:
         """Write down a function of torch."""
-        table = next(one._table for one in _flat((*args, *(kwargs or {}).values())))
+        table = next(one.table for one in _flat((*args, *(kwargs or {}).values())))
         return _row(table, func.__name__, args, kwargs or {})
 
     def __getattr__(self, name: str) -> Callable[..., Symbol]:
         if name.startswith("__") or not (name in OPERATIONS or name in _DERIVED or name in _SAME):
             raise AttributeError(name)
-        return lambda *args, **kwargs: _row(self._table, name, (self, *args), kwargs)
+        return lambda *args, **kwargs: _row(self.table, name, (self, *args), kwargs)
 
     __add__, __radd__ = _operator("add"), _operator("add", swapped=True)
     __sub__, __rsub__ = _operator("sub"), _operator("sub", swapped=True)
@@ -98,6 +99,10 @@ class Symbol:
     __lt__, __le__, __gt__, __ge__ = map(_operator, ("lt", "le", "gt", "ge"))
     __and__, __or__, __invert__ = map(_operator, ("and", "or", "not"))
     __neg__, __abs__ = _operator("neg"), _operator("abs")
+
+    def constant(self, value: float) -> Symbol:
+        """A number in the same table."""
+        return _symbol(self.table, value)
 
     def __bool__(self) -> bool:
         raise UntraceableError("it branches in Python on a value; use torch.where.")
@@ -147,7 +152,7 @@ def _row(
         raise UntraceableError(
             f"it calls {name}{given}; there are {', '.join(OPERATIONS)}, {', '.join(_DERIVED)}."
         )
-    rows = tuple(_symbol(table, part)._row for part in args)
+    rows = tuple(_symbol(table, part).row for part in args)
     return _appended(table, Operation(name, rows))
 
 
@@ -190,7 +195,7 @@ class Formula(NamedTuple):
         found = function(*(Symbol(table, i) for i in range(inputs)))
         if isinstance(found, Symbol | float | int) or not hasattr(found, "__len__"):
             raise UntraceableError("it returns one value; return a tuple or a list.")
-        results = tuple(_symbol(table, part)._row for part in found)
+        results = tuple(_symbol(table, part).row for part in found)
         return cls(inputs, tuple(table), results).pruned()
 
     def pruned(self) -> Formula:
@@ -227,6 +232,13 @@ class Formula(NamedTuple):
         like = v[0] if v else torch.zeros(())
         found = self.evaluated(v, OPERATIONS, like.new_tensor)
         return [torch.as_tensor(w).expand_as(like) for w in found]
+
+    def of_symbols(self, v: Sequence[Symbol]) -> list[Symbol]:
+        """w of symbols: the rows become rows of their table."""
+        table = v[0].table
+        operations = {name: partial(_row, table, name) for name in OPERATIONS}
+        apply = {name: (lambda *v, own=own: own(v)) for name, own in operations.items()}
+        return [_symbol(table, w) for w in self.evaluated(v, apply, partial(_symbol, table))]
 
     def described(self) -> dict[str, Any]:
         """The table for JSON."""

@@ -8,7 +8,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from lfrtorch._support.types import Array
+from lfrtorch.engine.formula_code import PYTHON, statements, with_slopes
 from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.engine.operations import Formula
 from lfrtorch.export.equations import (
     Equations,
     KalmanNoise,
@@ -95,9 +97,34 @@ def c_source(
         case Polynomial():
             known["monomials"] = True
             inner |= {"NM": e.static.C.shape[1], "NS": len(e.static.slopes)}
+        case Formula():
+            known["operations"] = _operations(e.static)
     known["inner"] = inner.items()
     header, source = rendered("model.h", **known), rendered("model.c", **known)
     return (_single(header), _single(source)) if single else (header, source)
+
+
+_C = {
+    name: text.replace("math.", "").replace("abs(", "fabs(") for name, text in PYTHON.items()
+} | {
+    "pow": "pow({0}, {1})", "relu": "{0} > 0.0 ? {0} : 0.0", "where": "{0} ? {1} : {2}",
+    "softplus": "({0} > 0.0 ? {0} : 0.0) + log(1.0 + exp(-fabs({0})))",
+    "sign": "{0} > 0.0 ? 1.0 : ({0} < 0.0 ? -1.0 : 0.0)", "maximum": "{0} >= {1} ? {0} : {1}",
+    "minimum": "{0} <= {1} ? {0} : {1}", "and": "{0} && {1}", "or": "{0} || {1}", "not": "!{0}",
+}  # fmt: skip
+"""Operations of formulas in C; what is true is 1.0."""
+
+
+def _operations(f: Formula) -> dict[str, list[tuple[str, str]]]:
+    """Assignments of the map and of its Jacobian."""
+    both, nw = with_slopes(f), len(f.results)
+    slopes = both._replace(results=both.results[nw:]).pruned()
+    found = {}
+    for name, to, formula in (("map", "w", f), ("jacobian", "J", slopes)):
+        made, results = statements(formula, [f"z[{i}]" for i in range(f.inputs)], _C)
+        lines = [(f"const double {t}", expression) for t, expression in made]
+        found[name] = lines + [(f"{to}[{i}]", result) for i, result in enumerate(results)]
+    return found
 
 
 def _single(text: str) -> str:

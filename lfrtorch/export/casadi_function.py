@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.optional import imported
 from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.engine.operations import Formula
 from lfrtorch.export.equations import (
     Equations,
     KalmanNoise,
@@ -185,7 +187,22 @@ def _static(ca: Any, e: Equations, z: Any) -> Any:
         for before, j in e.static.growth:
             m.append(m[before] * z[j])
         return ca.mtimes(e.weights["C"], ca.vertcat(*m))
+    if isinstance(e.static, Formula):
+        return ca.vertcat(*e.static.evaluated(ca.vertsplit(z), _operations(ca), ca.SX))
     assert isinstance(e.static, Network)
     v = ca.mtimes(e.weights["Wz"], z) + e.weights["bz"]
     h = e.static.sigma.casadi(ca, v)
     return ca.mtimes(e.weights["Ww"], h) + e.weights["bw"]
+
+
+def _operations(ca: Any) -> dict[str, Any]:
+    """Those of formulas."""
+    same = "sqrt exp log sin cos tan asin acos atan atan2 sinh cosh tanh sign"
+    return {name: getattr(ca, name) for name in same.split()} | {
+        "add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv,
+        "neg": operator.neg, "pow": ca.power, "sigmoid": lambda v: 1.0 / (1.0 + ca.exp(-v)),
+        "relu": lambda v: ca.fmax(v, 0.0), "abs": ca.fabs, "where": ca.if_else,
+        "softplus": lambda v: ca.fmax(v, 0.0) + ca.log(1.0 + ca.exp(-ca.fabs(v))),
+        "maximum": ca.fmax, "minimum": ca.fmin, "lt": ca.lt, "le": ca.le, "gt": ca.gt, "ge": ca.ge,
+        "and": ca.logic_and, "or": ca.logic_or, "not": ca.logic_not,
+    }  # fmt: skip

@@ -6,10 +6,17 @@ from collections.abc import Iterator
 from typing import Any
 
 from lfrtorch._support.optional import imported
+from lfrtorch.engine.formula_code import PYTHON, statements
 from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.engine.operations import Formula
 from lfrtorch.export.equations import Equations, check_name, equations, rendered
 from lfrtorch.linear.model import LinearModel, control_labels
 from lfrtorch.model import Model
+
+_NUMPY = {
+    name: text.replace("math.a", "np.arc").replace("math.", "np.") for name, text in PYTHON.items()
+}
+"""Operations of formulas in numpy, whose numbers may be infinite."""
 
 
 def control_system(model: Model | LinearModel, name: str = "model") -> Any:
@@ -70,6 +77,9 @@ def python_source(model: Model | LinearModel, name: str = "model") -> str:
     }
     if isinstance(e.static, Network):
         known["value"] = e.static.sigma.numpy
+    elif isinstance(e.static, Formula):
+        z = [f"z[{i}]" for i in range(e.static.inputs)]
+        known["operations"], known["results"] = statements(e.static, z, _NUMPY)
     sides = {"inputs": e.inputs, "outputs": e.outputs, "static": e.static}
     known |= {"labels": {name: control_labels(sides[name]) for name in ("inputs", "outputs")}}
     return rendered("model_py.txt", **known, **sides, **e.sizes, repr=repr)

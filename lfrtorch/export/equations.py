@@ -19,8 +19,9 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.data_reach import DataReach
 from lfrtorch.engine.cell import Matrices
-from lfrtorch.engine.nonlinearity import Network, Polynomial, known
+from lfrtorch.engine.nonlinearity import Network, Polynomial, formula_of, known, known_parts
 from lfrtorch.engine.operating_point import double, equilibrium
+from lfrtorch.engine.operations import Formula
 from lfrtorch.engine.simulation import folded
 from lfrtorch.extended_kalman_filter import NoiseCovariance, data_root
 from lfrtorch.linear.model import LinearModel
@@ -65,7 +66,7 @@ class Equations:
     u_offset: Array
     y_offset: Array
     x_rest: Array
-    static: Network | Polynomial | Own | None
+    static: Network | Polynomial | Own | Formula | None
     weights: Mapping[str, Array]
     fs: float
     inputs: tuple[Channel, ...]
@@ -102,6 +103,8 @@ class Equations:
                 static = ["w      = f(z) = C m, m = 1, z1, z2, .., z1 z1, z1 z2, .."]
             case Own():
                 static = [f"w      = f(z), the map {printable(self.static.name)}"]
+            case Formula():
+                static = ["w      = f(z), a step of the known model and what is learned beside it"]
             case None:
                 static = []
         z, w, bw = (["z      = Cz x + Dzu v"], " + Dyw w", " + Bw w") if static else ([], "", "")
@@ -170,7 +173,9 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
     """The equations of a model; ``own`` lets a static map of the user's own class pass."""
     model = model.to_model() if isinstance(model, LinearModel) else model
     cell, s = folded(model.lfr.cell), model.scaler
-    weights = {} if cell.static is None else cell.static.state_dict()
+    static = _static_map(cell.static, own)
+    listed = {} if cell.static is None or isinstance(static, Formula) else cell.static.state_dict()
+    weights = {name: w for name, w in listed.items() if not name.endswith("bounds")}
     M, y_scale = cell.matrices(), s.y_scale[:, None]
     found = Equations(
         matrices=M._replace(
@@ -180,7 +185,7 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
         u_offset=np.asarray(s.u_offset, dtype=np.float64),
         y_offset=np.asarray(s.y_offset, dtype=np.float64),
         x_rest=np.empty(0),
-        static=_static_map(cell.static, own),
+        static=static,
         weights={name: numbers(weight) for name, weight in weights.items()},
         fs=model.fs,
         inputs=model.inputs,
@@ -188,16 +193,19 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
         reach=model.reach,
     )  # fmt: skip
     parts = [*found.matrices, found.u_offset, found.y_offset, *found.weights.values()]
+    parts += [row.number for row in static.rows] if isinstance(static, Formula) else []
     if not all(np.isfinite(part).all() for part in parts):
         raise InputError("the model has weights that are not finite; nothing can be exported.")
     rest = equilibrium(double(cell), torch.zeros(cell.nu, dtype=torch.float64))
     return found if rest is None else replace(found, x_rest=numbers(rest))
 
 
-def _static_map(static: Module | None, own: bool) -> Network | Polynomial | Own | None:
+def _static_map(static: Module | None, own: bool) -> Network | Polynomial | Own | Formula | None:
     """f, if its equations are known or it may be of the user's own class."""
     if static is None or known(static) is not None:
         return known(static)
+    if known_parts(static) is not None:
+        return formula_of(static)
     if own:
         return Own(deepcopy(static).to(device="cpu", dtype=torch.float64).eval())
     raise InputError(

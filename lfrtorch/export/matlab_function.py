@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.lpv_form import gauss_legendre, lpv
 from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.engine.operations import Formula
 from lfrtorch.export.equations import (
     KalmanNoise,
     SteadyGain,
@@ -48,8 +50,8 @@ def matlab_function(
         The texts of the functions by the names of their files, and the variables of ``NAME.mat``.
 
     Raises:
-        ValueError: a static map of the user's own class, a name that is no identifier, or an
-            observer that the model has not.
+        ValueError: a known model, a static map of the user's own class, a name that is no
+            identifier, or an observer that the model has not.
 
     Example:
         >>> texts, variables = lfrtorch.export.matlab_function(model, "actuator")
@@ -62,7 +64,10 @@ def matlab_function(
     """
     check_name(name)
     model = model.to_model() if isinstance(model, LinearModel) else model
-    e, form = equations(model), lpv(model)
+    e = equations(model)
+    if isinstance(e.static, Formula):
+        raise InputError("a known model has no MATLAB code; export it to c, casadi, fmu or onnx.")
+    form = lpv(model)
     literals = {n: w if w.ndim == 2 else w[:, None] for n, w in e.arrays.items()}
     found: dict[str, Any] = {}
     found["fs"] = e.fs

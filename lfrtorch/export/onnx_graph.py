@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
 from lfrtorch.engine.activations import Activation
 from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.engine.operations import Formula
 from lfrtorch.export.equations import Equations, Own, check_name, equations
 from lfrtorch.export.traced_map import IR, OPSET, traced
 from lfrtorch.linear.model import LinearModel
@@ -70,13 +73,15 @@ def _sample(e: Equations, graph: Graph) -> None:
         return graph.node("Sum", *terms, *offset, to=to)
 
     x_next, y = {"A": "x", "Bu": v}, {"Cy": "x", "Dyu": v}
-    if e.static:
-        z = combined("z", {"Cz": "x", "Dzu": v})
+    if e.static is not None:
+        w = z = combined("z", {"Cz": "x", "Dzu": v})
         match e.static:
             case Network():
                 w = _network(graph, e, e.static.sigma, z)
             case Polynomial():
                 w = _polynomial(graph, e, e.static.growth, z)
+            case Formula():
+                w = _formula(graph, e.static, z)
             case Own():
                 w = graph.spliced(traced(e.static, e.sizes["nz"]), "f_", z)
         x_next["Bw"], y["Dyw"] = w, w
@@ -103,6 +108,39 @@ def _polynomial(graph: Graph, e: Equations, growth: Sequence[tuple[int, int]], z
     products = graph.node("Concat", *m[1:], axis=-1)
     w = graph.node("MatMul", products, graph.constant("C", C[:, 1:].T))
     return graph.node("Add", w, graph.constant("c", C[:, 0]))
+
+
+_NAMES = {
+    "add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "neg": "Neg", "pow": "Pow",
+    "relu": "Relu", "sigmoid": "Sigmoid", "abs": "Abs", "sign": "Sign", "maximum": "Max",
+    "minimum": "Min", "where": "Where", "lt": "Less", "le": "LessOrEqual", "gt": "Greater",
+    "ge": "GreaterOrEqual", "and": "And", "or": "Or", "not": "Not",
+} | {
+    name: name.capitalize() for name in (
+        "sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"
+    )
+}  # fmt: skip
+"""Operations of formulas as operators."""
+
+
+def _formula(graph: Graph, formula: Formula, z: str) -> str:
+    """w of a table of operations, on columns."""
+    if any(row.name == "atan2" for row in formula.rows):
+        raise InputError("ONNX has no operator for atan2, which the known model calls; use atan.")
+
+    def constant(value: float) -> str:
+        return graph.constant(f"number_{value!r}", np.array([[value]]))
+
+    def softplus(v: str) -> str:
+        near = graph.node("Exp", graph.node("Neg", graph.node("Abs", v)))
+        rest = graph.node("Log", graph.node("Add", near, constant(1.0)))
+        return graph.node("Add", graph.node("Relu", v), rest)
+
+    each = graph.split("Split", z, to=[f"z{j}" for j in range(formula.inputs)], axis=-1)
+    apply: dict[str, Any] = {name: partial(graph.node, own) for name, own in _NAMES.items()}
+    results = formula.evaluated(each, {**apply, "softplus": softplus}, constant)
+    nothing = graph.node("Mul", each[0], constant(0.0))  # a result may be a constant
+    return graph.node("Concat", *(graph.node("Add", w, nothing) for w in results), axis=-1)
 
 
 class Graph:

@@ -118,6 +118,26 @@ static void map_jacobian(const double *z, double *J)
 }
 
 {% endif %}
+{% if operations %}
+/* w = f(z). */
+static void map(const double *z, double *w)
+{
+    (void)z;
+{% for to, value in operations.map %}
+    {{ to }} = {{ value }};
+{% endfor %}
+}
+
+/* J = dw/dz. */
+static void map_jacobian(const double *z, double *J)
+{
+    (void)z;
+{% for to, value in operations.jacobian %}
+    {{ to }} = {{ value }};
+{% endfor %}
+}
+
+{% endif %}
 void {{ name }}_reset(double x[NX])
 {
     for (int i = 0; i < NX; i++)
