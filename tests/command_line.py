@@ -22,8 +22,10 @@ SHORTER = {  # fewer samples and iterations, so that two iterations take a secon
     "boucwen": f"data.samples={PERIOD} starts=2 bla.max_iter=1",
     "boucwen_record": f"data.samples={PERIOD} data.rms=[50,25] bla.max_iter=1 starts=1",
     "cascaded_tanks": "bla.max_iter=1 starts=1",
+    "cascaded_tanks_known": "bla.max_iter=1 starts=1 nn=2",
     "ced": "bla.max_iter=1 starts=1",
     "emps": "data.validation=0.8 bla.max_iter=1 starts=1 refit=false",
+    "emps_known": "data.validation=0.8 bla.max_iter=1 starts=1",
     "f16": "data.train=[multisine_3] data.validation=[multisine_5] nx=6 modes=1"
     " bla.max_iter=1 starts=1 first_part=1 refit=false",
     "fine_steering_mirror": "data.levels=[100] data.validation=5 nx=4 nz=1 nw=1 nn=4 relaxations=1"

@@ -21,7 +21,7 @@ from lfrtorch.records import Record
 _ALIKE = 0.95
 """Correlation from which a note names two parameters."""
 
-_TAKEN_OVER = 10.0
+_TAKEN_OVER = 5.0
 """Standard error relative to that with the learned part held, from which a note says so."""
 
 _AT_BOUND = 1e-6

@@ -1,0 +1,231 @@
+"""Fits of models that are partly known: what is found, what is kept, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import lfrtorch
+from lfrtorch import Dataset, InputError, Known, Parameter, Record, Settings, State
+from lfrtorch.analysis import PhysicalParameters, canonical, physical_parameters, uncertainty
+from lfrtorch.engine.nonlinearity import known_parts
+from lfrtorch.fitting.known_start import known_model, varied
+
+FS, DAMPING, GRAVITY = 20.0, 0.3, 5.0
+
+
+def pendulum(x: Any, u: Any, p: Any) -> Any:
+    return x.speed, u[0] - p.damping * x.speed - p.gravity * torch.sin(x.angle)
+
+
+def swing(x: Any, u: Any, p: Any) -> Any:
+    return x.speed, u[0] - GRAVITY * torch.sin(x.angle)
+
+
+def known(**options: Any) -> Known:
+    usual: dict[str, Any] = {
+        "states": ["angle", State("speed", unit="rad/s")],
+        "parameters": {
+            "damping": Parameter(0.1, low=0.0, unit="1/s"), "gravity": Parameter(8.0, unit="1/s²"),
+        },
+        "sees": ["speed"], "acts_on": ["speed"],
+    }  # fmt: skip
+    return Known(pendulum, **{**usual, **options})
+
+
+def record(drag: float, samples: int = 400, seed: int = 0, noise: float = 1e-3) -> Record:
+    """A pendulum with a drag that its equations do not have."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(1.5 * rng.standard_normal(samples // 8), 8)
+    x, y = np.zeros(2), []
+    for force in u:
+        y.append(x[0])
+        for _ in range(20):
+            rate = force - DAMPING * x[1] - drag * x[1] * abs(x[1]) - GRAVITY * np.sin(x[0])
+            x = x + np.array([x[1], rate]) / (20 * FS)
+    return Record(u, np.array(y) + noise * rng.standard_normal(len(u)), fs=FS)
+
+
+def identified(train: Record, **settings: Any) -> lfrtorch.Run:
+    usual: dict[str, Any] = {"known": known(), "starts": 2}
+    dataset = Dataset("pendulum", [train], [], [])
+    return lfrtorch.identify(dataset, Settings(**{**usual, **settings}))
+
+
+@pytest.fixture(scope="module")
+def grey() -> lfrtorch.Run:
+    return identified(record(drag=0.0), nn=0)
+
+
+@pytest.fixture(scope="module")
+def both() -> lfrtorch.Run:
+    return identified(record(drag=0.3), nz=1, nw=1, nn=4, ridge=1e-2)
+
+
+def test_a_grey_box_finds_its_parameters_within_their_errors(grey: lfrtorch.Run):
+    found = grey.parameters
+    assert found is not None
+    assert found.names == ("damping", "gravity")
+    assert found.units == ("1/s", "1/s²")
+    # The integration of the record, by Euler, is 1 % off.
+    np.testing.assert_allclose(found.values, [DAMPING, GRAVITY], atol=0.06)
+    assert np.all((found.errors > 0) & (found.errors < 0.05))
+    assert found.notes == ()
+    assert grey.model.parameter_count == 2
+    assert grey.metrics["known"]["values"]["gravity"]["unit"] == "1/s²"
+    assert "gravity" in str(grey)
+
+
+def test_standard_errors_are_those_over_many_noises():
+    found = [identified(record(0.0, seed=7, noise=0.0), nn=0)]
+    exact = found[0].model
+    rng, rec = np.random.default_rng(1), record(0.0, seed=7, noise=0.0)
+    values, told = [], []
+    for _ in range(12):
+        noisy = Record(rec.u, exact.simulate(rec) + 0.01 * rng.standard_normal(rec.y.shape), fs=FS)
+        run = identified(noisy, nn=0, starts=1)
+        assert run.parameters is not None
+        values.append(run.parameters.values)
+        told.append(run.parameters.errors)
+    ratio = np.std(values, axis=0, ddof=1) / np.mean(told, axis=0)
+    assert np.all((ratio > 0.5) & (ratio < 1.9))  # 99 % of 12 are within 0.49 and 1.56
+
+
+def test_what_is_learned_sees_and_acts_where_it_may(both: lfrtorch.Run):
+    cell, own = both.model.lfr.cell, 3
+    assert (cell.nx, cell.nz, cell.nw) == (2, own + 1, own + 1)
+    assert cell.Cz[own, 0] == 0 and cell.Cz[own, 1] != 0  # noqa: PT018
+    assert cell.Dzu[own, 0] == 0
+    assert cell.Bw[0, own] == 0 and cell.Bw[1, own] != 0  # noqa: PT018
+    assert cell.Dyw[0, own] == 0
+    torch.testing.assert_close(cell.Cz[:2], torch.eye(2, dtype=torch.float64))
+
+
+def test_a_learned_part_finds_what_the_equations_do_not_have(both: lfrtorch.Run):
+    train, other = record(drag=0.3), record(drag=0.3, seed=5)
+    alone = identified(train, nn=0)
+    errors = [lfrtorch.rmse(other, run.model.simulate(other)) for run in (both, alone)]
+    assert errors[0] < 0.25 * errors[1]
+
+
+def test_bounds_hold_and_are_told():
+    bounded = known(parameters={"damping": Parameter(0.6, low=0.5), "gravity": GRAVITY})
+    run = identified(record(drag=0.0), known=bounded, nn=0)
+    assert run.parameters is not None
+    assert run.parameters.values[0] == pytest.approx(0.5)
+    assert any("at a bound" in note and "damping" in note for note in run.parameters.notes)
+
+
+def test_a_learned_part_that_says_the_same_is_noted():
+    run = identified(record(drag=0.0), nz=1, nw=1, nn=4, starts=1)
+    assert run.parameters is not None
+    assert any("can take the place of damping" in note for note in run.parameters.notes)
+
+
+@pytest.mark.parametrize("settings", [{"nx": 1, "nz": 2, "nw": 1, "nn": 3}, {"nn": 0}])
+def test_a_checkpoint_holds_the_equations(settings: dict[str, Any], tmp_path: Path):
+    train = record(drag=0.0)
+    model = identified(train, starts=1, **settings).model
+    model.save(tmp_path / "model")
+    again = lfrtorch.load(tmp_path / "model")
+    np.testing.assert_array_equal(again.simulate(train), model.simulate(train))
+    assert again.lfr.cell.fixed.keys() == model.lfr.cell.fixed.keys()
+    parts = known_parts(again.lfr.cell.static)
+    assert parts is not None
+    np.testing.assert_array_equal(parts[0].bounds[0], [0.0, np.inf])
+    found = physical_parameters(again, train)
+    assert isinstance(found, PhysicalParameters)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"nz": 1, "nw": 1, "nn": 3, "horizon": 100},
+        {"nx": 1, "nz": 2, "nw": 1, "static": "polynomial", "degree": 2},
+        {"nz": 1, "nw": 1, "nn": 3, "trainer": lfrtorch.Adam(max_iter=3)},
+        {"nn": 0, "dtype": torch.float32},
+        {"known": Known(swing, states=["angle", "speed"]), "nz": 1, "nw": 1, "nn": 3},
+        {"known": known(method="euler", substeps=5), "nn": 0},
+        {"known": known(intersample="bl"), "nn": 0},
+    ],
+    ids=["windows", "polynomial", "adam", "float32", "no parameters", "euler", "bl"],
+)
+def test_other_features_work_with_it(settings: dict[str, Any]):
+    train = record(drag=0.1)
+    run = identified(train, starts=1, **settings)
+    assert lfrtorch.rmse(train, run.model.simulate(train)) < 0.3 * np.std(train.y)
+
+
+def test_it_is_refitted_with_validation_and_has_bands_and_a_canonical_form(both: lfrtorch.Run):
+    train, held_out = record(0.3), record(0.3, seed=3)
+    dataset = Dataset("pendulum", [train], [held_out], [])
+    run = lfrtorch.identify(
+        dataset, Settings(known=known(), nz=1, nw=1, nn=3, starts=1, refit=True)
+    )
+    assert run.refit is not None
+    assert np.isfinite(uncertainty(both.model, train).simulate(train).y).all()
+    form = canonical(both.model, train).model
+    difference = form.simulate(train) - both.model.simulate(train)
+    assert np.abs(difference).max() < 1e-8
+
+
+def test_starts_vary_within_the_bounds():
+    train = record(drag=0.0)
+    narrow = {"damping": Parameter(0.3, low=0.25, high=0.35), "gravity": Parameter(0.0, scale=2.0)}
+    linear = lfrtorch.estimate_bla(train, nx=2)
+    model = known_model(known(parameters=narrow), linear, [train])
+    for seed in range(5):
+        parts = known_parts(varied(model, seed).lfr.cell.static)
+        assert parts is not None
+        assert 0.25 - 1e-9 <= parts[0].physical["damping"] <= 0.35 + 1e-9
+        assert parts[0].physical["gravity"] != 0.0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Parameter(1.0, low=2.0), "value is 1.0, its bounds 2.0 and inf"),
+        (lambda: Parameter(float("nan")), "value is nan; give a finite number"),
+        (lambda: State("a", scale=-1.0), "scale"),
+        (lambda: known(states=[]), "states is empty"),
+        (lambda: known(states=["a b"]), "a name of a state or parameter cannot be one"),
+        (lambda: known(method="bdf"), "method"),
+        (lambda: known(method="discrete", substeps=2), "substeps=1 with 'discrete'"),
+        (lambda: known(method="discrete", intersample="bl"), "nothing between samples"),
+        (lambda: known(sees=["position"]), "give some of angle, speed, u"),
+        (lambda: known(acts_on=[]), "give some of angle, speed, y"),
+        (lambda: known().equations(1, 3), "has 2 state"),
+        (
+            lambda: Known(lambda x, u, p: (x.a,), states=["a", "b"]).equations(1, 1),
+            "returns 1 values; give 2",
+        ),
+        (
+            lambda: Known(lambda x, u, p: (x.b,), states=["a"]).equations(1, 1),
+            "f of the known model fails: .*has no attribute 'b'",
+        ),
+        (
+            lambda: Known(lambda x, u, p: (x.a if x.a > 0 else 0,), states=["a"]).equations(1, 1),
+            "it branches in Python on a value; use torch.where",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(make: Any, message: str):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"nz": "auto", "nw": 1, "nn": 2}, "beside a known model none is searched"),
+        ({"nz": 1, "nw": 1, "nn": 2, "noise": "innovation"}, "known is"),
+        ({"nz": 1, "nw": 1, "nn": 2, "init": "paper"}, "known is"),
+    ],
+)
+def test_settings_that_exclude_it_are_refused(settings: dict[str, Any], message: str):
+    with pytest.raises(InputError, match=message):
+        identified(record(0.0), **settings)
