@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any
@@ -40,7 +41,7 @@ def configured(cfg: DictConfig) -> Settings:
     return Settings(
         **{one.name: plain[one.name] for one in fields(PlainSettings)},
         static=partial(own_map, cfg) if cfg.static.kind == "own" else cfg.static.kind,
-        known=None if cfg.known._target_ is None else instantiate(cfg.known),
+        known=None if cfg.known._target_ is None else users_own(cfg.known),
         linear=plain["bla"],
         trainer=instantiate(cfg.trainer),
         init_from=None if cfg.init_from is None else opened(cfg),
@@ -58,7 +59,14 @@ def limit_threads(cfg: DictConfig) -> None:
 def own_map(cfg: DictConfig, nz: int, nw: int) -> Module:
     """A static map of the user's own."""
     options = {name: value for name, value in cfg.static.items() if name != "kind"}
-    return instantiate(options, nz=nz, nw=nw)
+    return users_own(options, nz=nz, nw=nw)
+
+
+def users_own(node: Any, **options: Any) -> Any:
+    """What a target of the user's own makes; its module may stand in the working directory."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    return instantiate(node, **options)
 
 
 def opened(cfg: DictConfig) -> lfrtorch.Model:

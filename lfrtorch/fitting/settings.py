@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from inspect import signature
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from torch.nn import Module
@@ -55,7 +55,8 @@ class Settings(PlainSettings):
     known: Known | None = setting(
         None,
         "a model of the physics; nz, nw and nn or degree are those of the map that is learned "
-        "beside it (nn=0: none), and nx the states beside its own. Default: nothing is known.",
+        "beside it (nn=0: none), and nx the states beside its own; auto: nn and nx are 0, z is all "
+        "that it sees and w all that it acts on. Default: nothing is known.",
     )
     linear: Mapping[str, Any] = setting(
         dict, 'options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.'
@@ -76,8 +77,8 @@ class Settings(PlainSettings):
                 f"trainer is {self.trainer!r}; give lfrtorch.LevenbergMarquardt() or "
                 "lfrtorch.Adam()."
             )
-        if self.known is not None and self.nx is None:
-            object.__setattr__(self, "nx", 0)
+        if self.known is not None:
+            self._complete_known(self.known)
         if self.init_from is None and self.nx is None:
             raise InputError(
                 "nx, the number of states, is not set: give nx=2, for example, or nx='auto'."
@@ -123,9 +124,18 @@ class Settings(PlainSettings):
                 "the device cpu always works."
             ) from None
 
+    def _complete_known(self, known: Known) -> None:
+        """Sizes that are auto: nothing is learned, or z and w have all it sees and acts on."""
+        nx = 0 if self.nx in (None, "auto") else cast(int, self.nx)
+        states = [name for name in known.acts_on if name != "y"]
+        rule = {"nx": nx, "nz": nx + len(known.sees), "nw": nx + max(1, len(states)), "nn": 0}
+        for name, size in rule.items():
+            if getattr(self, name) in (None, "auto"):
+                object.__setattr__(self, name, size)
+
     def _check_known(self) -> None:
         """Refuse what is not for a known model."""
-        for name in ("nx", "nz", "nw", "nn", "degree", "ridge"):
+        for name in ("degree", "ridge"):
             if getattr(self, name) == "auto":
                 raise InputError(f"{name} is auto, and beside a known model none is searched.")
         integer("nx", self.nx, 0)

@@ -56,7 +56,7 @@ def diverges(e: Evidence) -> Advice | None:
     """A record on which the simulation runs away."""
     if not e.diverged:
         return None
-    change = {} if e.ridge or e.continued or e.proven else {"ridge": "auto"}
+    change = {} if e.ridge or e.given else {"ridge": "auto"}
     ridge = _written(change) if change else "a larger ridge" if e.ridge else "ridge=1e-3"
     loud = any(e.louder.get(name, 0.0) > EXTRAPOLATES for name in e.diverged)
     return Advice(
@@ -176,8 +176,8 @@ def overfits(e: Evidence) -> Advice | None:
         )
     else:
         return None
-    change = {} if e.searched or e.ridge or e.continued or e.proven else {"ridge": "auto"}
-    ridge = f"{_written(change)}, or " if change else ""
+    change = {} if e.searched or e.ridge or e.given else {"ridge": "auto"}
+    ridge = f"{_written(change)}, or " if change else "a larger ridge, or " if e.known else ""
     return Advice(f"Overfit: {ridge}more data.", evidence, change or None)
 
 
@@ -187,10 +187,12 @@ def linear_part_incomplete(e: Evidence) -> Advice | None:
         return None
     nx = e.sizes.get("nx", 0)
     order = f"nx={nx + 1}, nx={nx + 2} or nx='auto'" if nx else "a higher nx"
+    if e.known:
+        order = f"nx={nx + 1} or nx={nx + 2} states beside the known ones"
     return Advice(
         f"The linear part is incomplete: {order}.",
         f"a linear filter of the inputs explains {percent(e.linear)} of the error's power",
-        {"nx": nx + 1} if nx else None,
+        {"nx": nx + 1} if nx or e.known else None,
     )
 
 
@@ -283,7 +285,7 @@ def best_start_alone(e: Evidence) -> Advice | None:
 def one_start(e: Evidence) -> Advice | None:
     """Nothing to compare the minimum with."""
     said = e.useless and not e.overtrained
-    if e.started > 1 or e.continued or said or e.validation is None or e.parts_differ:
+    if e.started > 1 or e.given or said or e.validation is None or e.parts_differ:
         return None  # without validation the start that overfits most would be chosen
     return Advice(
         "Try several starts: starts=8.",
@@ -310,7 +312,7 @@ def tests_are_louder(e: Evidence) -> Advice | None:
 
 def choose_sizes(e: Evidence) -> Advice | None:
     """Sizes that were guessed, and validation records that can choose them."""
-    if e.searched or e.continued or e.proven or e.validation is None or e.parts_differ:
+    if e.searched or e.given or e.validation is None or e.parts_differ:
         return None
     static = "degree" if e.sizes.get("degree") else "nn"
     change: dict[str, Any] = dict.fromkeys(["nx", "nz", "nw", static], "auto")
@@ -357,6 +359,8 @@ _RULES = (  # the most useful first, and whether a rule is on the sizes or the s
 
 def _larger(e: Evidence, states: Mapping[str, int] = MappingProxyType({})) -> dict[str, int]:
     """Sizes of a larger static map, and of more states; none if the samples do not bear them."""
+    if e.known and not (e.sizes.get("nn") or e.sizes.get("degree")):
+        return {"nz": 2, "nw": 1, "nn": 4}
     signals = {name: max(2, e.sizes.get(name, 0) + 1) for name in ("nz", "nw")}
     static = {"degree": e.sizes["degree"] + 2} if e.sizes.get("degree") else {}
     if e.sizes.get("nn"):

@@ -91,6 +91,7 @@ class Evidence:
     started: int = 1
     continued: bool = False  # from a model, so that there are no other starts
     sizes: Mapping[str, int] = field(default_factory=dict)  # nx is that of the linear model
+    known: bool = False  # whether a part of the model is; sizes are then those of the rest
     searched: bool = False  # whether the data chose them
     trainer: Any = field(default_factory=LevenbergMarquardt)
     ridge: bool = False
@@ -201,6 +202,11 @@ class Evidence:
         """Whether every step kept a proof, so that no sizes or ridge can be chosen."""
         return getattr(self.trainer, "guarantee", None) not in (None, "stable")
 
+    @property
+    def given(self) -> bool:
+        """Whether sizes and ridge cannot be left to the data."""
+        return self.continued or self.proven or self.known
+
 
 def evidence(
     result: FitResult,
@@ -238,6 +244,7 @@ def evidence(
     transient, free = (None, None) if bla is None else _transient(train, scale, bla)
     test = _error([r.error for r in tests], scale)
     linear_test = _error([r.linear_error for r in tests], scale)
+    known = result.model.known_states > 0
     return Evidence(
         train=_error([r.error for r in train], scale),
         linear_train=_error([r.linear_error for r in train], scale),
@@ -259,7 +266,8 @@ def evidence(
         starts=_finished(result),
         started=max(1, len(result.starts)),
         continued=continued,
-        sizes=result.model.sizes if bla is None else {**result.model.sizes, "nx": bla.nx},
+        sizes=result.model.sizes | ({} if bla is None or known else {"nx": bla.nx}),
+        known=known,
         searched=searched,
         trainer=LevenbergMarquardt() if trainer is None else trainer,
         ridge=ridge,

@@ -73,7 +73,7 @@ def test_every_bench_composes(bench: str):
     cfg = configuration(f"+bench={bench}")
     assert cfg.name == bench
     settings = config.configured(cfg)
-    dataset = bench.removesuffix("_record")
+    dataset = bench.removesuffix("_record").removesuffix("_known")
     assert cfg.data["_target_"] == f"lfrtorch.datasets.{dataset}.load"
     assert settings.sizes.items() <= dict(cfg).items()
     arguments = inspect.signature(get_object(cfg.data["_target_"])).parameters

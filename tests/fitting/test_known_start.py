@@ -173,6 +173,14 @@ def test_it_is_refitted_with_validation_and_has_bands_and_a_canonical_form(both:
     assert np.abs(difference).max() < 1e-8
 
 
+def test_sizes_that_are_auto_are_those_of_what_it_sees_and_acts_on():
+    settings = Settings(known=known(), nx="auto", nz="auto", nw="auto", nn="auto")
+    assert (settings.nx, settings.nz, settings.nw, settings.nn) == (0, 1, 1, 0)
+    everything = known(sees=None, acts_on=None)
+    settings = Settings(known=everything, nx=1, nz="auto", nw="auto", nn=3)
+    assert (settings.nx, settings.nz, settings.nw, settings.nn) == (1, 4, 3, 3)
+
+
 def test_starts_vary_within_the_bounds():
     train = record(drag=0.0)
     narrow = {"damping": Parameter(0.3, low=0.25, high=0.35), "gravity": Parameter(0.0, scale=2.0)}
@@ -221,7 +229,7 @@ def test_what_cannot_be_is_refused(make: Any, message: str):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"nz": "auto", "nw": 1, "nn": 2}, "beside a known model none is searched"),
+        ({"nz": 1, "nw": 1, "nn": 2, "ridge": "auto"}, "beside a known model none is searched"),
         ({"nz": 1, "nw": 1, "nn": 2, "noise": "innovation"}, "known is"),
         ({"nz": 1, "nw": 1, "nn": 2, "init": "paper"}, "known is"),
     ],
