@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from copy import deepcopy
 from dataclasses import fields, replace
@@ -14,7 +14,7 @@ import torch
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.tables import number, quantity
+from lfrtorch._support.tables import number, percent, quantity
 from lfrtorch._support.threads import each_alone
 from lfrtorch.analysis.physical_parameters import physical_parameters
 from lfrtorch.dataset import Dataset
@@ -24,6 +24,7 @@ from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.exclusions import allowed
 from lfrtorch.fitting.first_fit import begun_on_part, part_of
+from lfrtorch.fitting.given_entries import with_given
 from lfrtorch.fitting.known_start import known_starts
 from lfrtorch.fitting.last_fits import distilled, refitted, without_poor_starts
 from lfrtorch.fitting.multistart import cheap_starts, fit
@@ -158,6 +159,13 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
         settings, models = starting_models(
             dataset.train, settings, begun, observer, chosen=choice is not None
         )
+    if settings.fixed:
+        found = [with_given(model, settings.fixed) for model in models]
+        models = [model for model, _ in found]
+        observer.say(
+            "fixed: the start differed from what is given by "
+            f"{percent(max(apart for _, apart in found))} of a matrix's largest entry at most"
+        )
     settings, models = begun_on_part(replace(stage, settings=settings), models)
     average = _most_averaged(models, settings.average, observer)
     samples = sum(record.samples for record in dataset.train)
@@ -280,7 +288,8 @@ def scored_run(
         of = dataset.train
         if again is not None:
             of = all_records(dataset.train, [*dataset.validation, *dataset.selection])
-        known = physical_parameters((again or result).model, of)
+        ridge = 0.0 if isinstance(settings.ridge, Mapping | str) else settings.ridge
+        known = physical_parameters((again or result).model, of, ridge=ridge)
     numbers = metrics(
         result,
         evaluation,

@@ -50,6 +50,10 @@ _TRUNCATION = 1e-8
 """Singular values of J, of columns of unit length, that count as zero relative to the largest."""
 
 
+NOT_AT_MINIMUM = "the fit is not at its minimum"
+"""How a note begins that says so."""
+
+
 @dataclass(frozen=True, eq=False)
 class Band:
     """A simulated output and how far it is known, in physical units.
@@ -496,7 +500,7 @@ def _doubts(
         )
     if left[0] > 1.0:  # standard errors, rms over the directions
         found.append(
-            f"the fit is not at its minimum: a step would be {number(left[0], 2)} standard errors "
+            f"{NOT_AT_MINIMUM}: a step would be {number(left[0], 2)} standard errors "
             f"long and lower the squared error by {percent(left[1])}; bands are about the minimum."
         )
     if rank < len(W):

@@ -13,10 +13,10 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import Cell, in_lines, number, table
 from lfrtorch._support.types import Array
-from lfrtorch.analysis.confidence_bands import uncertainty
+from lfrtorch.analysis.confidence_bands import NOT_AT_MINIMUM, uncertainty
 from lfrtorch.engine.nonlinearity import known_parts
 from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.records import Record, as_records
 
 _ALIKE = 0.95
 """Correlation from which a note names two parameters."""
@@ -80,7 +80,9 @@ class PhysicalParameters:
 
 
 @typed()
-def physical_parameters(model: Model, records: Record | Sequence[Record]) -> PhysicalParameters:
+def physical_parameters(
+    model: Model, records: Record | Sequence[Record], *, ridge: float = 0.0
+) -> PhysicalParameters:
     """The parameters of a fitted known model, with standard errors.
 
     These are the errors by noise, corrected for its colour, of all that was fitted together: what
@@ -89,6 +91,8 @@ def physical_parameters(model: Model, records: Record | Sequence[Record]) -> Phy
     Args:
         model: with a known model.
         records: what it was fitted to, with starts, skips and weights as in the fit.
+        ridge: that of the fit; as it says how far parameters may be from where the search began, it
+            tells apart what the data do not.
 
     Raises:
         ValueError: a model that has no known part.
@@ -121,20 +125,26 @@ def physical_parameters(model: Model, records: Record | Sequence[Record]) -> Phy
     except InputError as error:
         notes.append(f"no standard errors: {error}")
     else:
-        first, own = 0, slice(0, 0)
-        for _, p in model.lfr.cell.named_parameters():
-            if p is known.p:
-                own = slice(first, first + n)
-            first += p.numel() if p.requires_grad else 0
-        whole = found.covariance
-        part = whole[own, own] * np.outer(scale, scale)
-        errors = np.sqrt(np.diag(part))
-        safe = np.where(errors > 0, errors, 1.0)
-        correlation = part / np.outer(safe, safe)
-        information = np.linalg.pinv(whole, hermitian=True)[own, own]
-        alone = scale * np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
+        free = [p for p in model.lfr.cell.parameters() if p.requires_grad]
+        is_own = np.repeat([p is known.p for p in free], [p.numel() for p in free])
+        is_own = is_own[found.kept.numpy()]
+        doubts, knows = found.doubts, np.linalg.pinv(found.factor.numpy())  # a root of J' J
+        if ridge:
+            misses = [record.y - model.simulate(record) for record in as_records(records)]
+            deviation = np.sqrt(np.nanmean((np.concatenate(misses) / model.scaler.y_scale) ** 2))
+            knows = np.concatenate([knows, np.sqrt(ridge) / deviation * np.eye(len(is_own))])
+            doubts = [doubt for doubt in doubts if not doubt.startswith(NOT_AT_MINIMUM)]
+            notes.append(
+                "these standard errors take the ridge as knowledge, of values near those of the "
+                "parameters alone; a fit with nn=0, nx=0 says how well the data tell these."
+            )
+        root = scale[:, None] * np.linalg.pinv(knows)[is_own]
+        errors = np.linalg.norm(root, axis=1)
+        safe = np.where(errors > 0, errors, 1.0)[:, None]
+        correlation = (root / safe) @ (root / safe).T
+        alone = scale * np.linalg.norm(np.linalg.pinv(knows[:, is_own]), axis=1)
         notes += _notes(names, errors, correlation, alone, learned=learned is not None)
-        notes += found.doubts
+        notes += doubts
     low, high = known.bounds.detach().double().cpu().numpy().T
     at = np.minimum(np.abs(values - low), np.abs(values - high)) <= _AT_BOUND * scale
     if at.any():

@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torch.nn import Module
@@ -42,6 +43,7 @@ def configured(cfg: DictConfig) -> Settings:
         **{one.name: plain[one.name] for one in fields(PlainSettings)},
         static=partial(own_map, cfg) if cfg.static.kind == "own" else cfg.static.kind,
         known=None if cfg.known._target_ is None else users_own(cfg.known),
+        fixed={name: np.array(matrix, dtype=float) for name, matrix in plain["fixed"].items()},
         linear=plain["bla"],
         trainer=instantiate(cfg.trainer),
         init_from=None if cfg.init_from is None else opened(cfg),

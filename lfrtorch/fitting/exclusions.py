@@ -11,6 +11,7 @@ from lfrtorch.fitting.plain_settings import PlainSettings
 
 USUAL = {one.name: one.default for one in fields(PlainSettings)} | {
     "static": "network", "guarantee": None, "integrators": 0, "known": None, "init_from": None,
+    "fixed": {},
 }  # fmt: skip
 """Defaults, which exclude nothing."""
 
@@ -69,6 +70,13 @@ EXCLUSIONS = (
     Exclusion("known", "init", "what is learned beside it begins at zero"),
     Exclusion("known", "average", "a mean of models has no parameters of its own"),
     Exclusion("known", "distil", "a mean of models has no parameters of its own"),
+    Exclusion("fixed", "known", "the known model has matrices of its own"),
+    Exclusion("fixed", "noise", "the gain of innovations would change what is given"),
+    Exclusion("fixed", "structure", "a structure has zeros of its own"),
+    Exclusion("fixed", "average", "a mean of models has more states"),
+    Exclusion("fixed", "distil", "a mean of models has more states"),
+    Exclusion("guarantee", "fixed", "its certificate moves all matrices", ("contracting", float)),
+    Exclusion("fixed", "integrators", "integrators have entries of their own"),
     Exclusion("known", "init_from", "the model brings what is known of it"),
 )
 

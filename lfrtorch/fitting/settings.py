@@ -58,6 +58,12 @@ class Settings(PlainSettings):
         "beside it (nn=0: none), and nx the states beside its own; auto: nn and nx are 0, z is all "
         "that it sees and w all that it acts on. Default: nothing is known.",
     )
+    fixed: Mapping[str, Any] = setting(
+        dict,
+        "entries of the matrices that are given, with u and y in physical units, "
+        '``{"Cy": [[1.0, 0.0]]}``; NaN for those that are free. The start is put into coordinates '
+        "that have them.",
+    )
     linear: Mapping[str, Any] = setting(
         dict, 'options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.'
     )

@@ -285,7 +285,7 @@ def best_start_alone(e: Evidence) -> Advice | None:
 def one_start(e: Evidence) -> Advice | None:
     """Nothing to compare the minimum with."""
     said = e.useless and not e.overtrained
-    if e.started > 1 or e.given or said or e.validation is None or e.parts_differ:
+    if e.started > 1 or e.continued or e.known or said or e.validation is None or e.parts_differ:
         return None  # without validation the start that overfits most would be chosen
     return Advice(
         "Try several starts: starts=8.",

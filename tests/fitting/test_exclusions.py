@@ -30,7 +30,8 @@ OTHERS: dict[str, tuple[Any, ...]] = {
     "relaxations": (1,), "modes": (2,), "z_feedthrough": (False,),
     "noise": ("innovation", "both"), "horizon": (50,), "first_part": (0.5,), "average": (2,),
     "ridge": (0.1, {"static": 0.1}),
-    "known": (KNOWN,), "init": ("paper",), "init_from": (begun(),), "feedthrough": (False,),
+    "known": (KNOWN,), "fixed": ({"Cy": [[1.0, 0.0]]},),
+    "init": ("paper",), "init_from": (begun(),), "feedthrough": (False,),
     "distil": (True,), "guarantee": ("stable", "contracting"), "integrators": (1,),
 }  # fmt: skip
 """Values that are no defaults."""

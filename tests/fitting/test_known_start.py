@@ -237,3 +237,12 @@ def test_what_cannot_be_is_refused(make: Any, message: str):
 def test_settings_that_exclude_it_are_refused(settings: dict[str, Any], message: str):
     with pytest.raises(InputError, match=message):
         identified(record(0.0), **settings)
+
+
+def test_a_ridge_tells_apart_what_the_data_do_not(both: lfrtorch.Run):
+    train = record(drag=0.3)
+    free, kept = physical_parameters(both.model, train), both.parameters
+    assert kept is not None
+    assert np.all(kept.errors <= 1.001 * free.errors)
+    tight = physical_parameters(both.model, train, ridge=1e9)
+    assert np.all(tight.errors < 1e-3 * free.errors)
