@@ -28,6 +28,7 @@ from lfrtorch.analysis.canonical_form import nearest_affine, whitening
 from lfrtorch.analysis.linearisation import linear_part, linearise
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import static_slope
+from lfrtorch.engine.nonlinearity import known_parts
 from lfrtorch.engine.operating_point import double
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rms
@@ -63,7 +64,7 @@ def model_figure(model: Model, records: Record | Sequence[Record] | None = None)
     systems = {"linear part": linear_part(model)}
     with suppress(InputError):  # it may have no rest at the offsets
         systems["at rest"] = linearise(model)
-    cell = double(model.lfr.cell)
+    cell = _learned(double(model.lfr.cell))
     pairs = [(i, j) for i in range(cell.ny) for j in range(cell.nu)][:4]
     maps = min(cell.nw, _MOST_MAPS)
     height = max(_LEAST_HEIGHT, _HEIGHT * max(len(pairs), -(-maps // 2)))
@@ -81,7 +82,7 @@ def model_figure(model: Model, records: Record | Sequence[Record] | None = None)
 
 def static_figure(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:
     """The last part of that figure alone: the nonlinearity of the static map."""
-    cell = double(model.lfr.cell)
+    cell = _learned(double(model.lfr.cell))
     if not cell.nw:
         raise InputError("the model is linear and has no static map to draw.")
     maps = min(cell.nw, _MOST_MAPS)
@@ -89,6 +90,16 @@ def static_figure(model: Model, records: Record | Sequence[Record] | None = None
     figure = Figure(figsize=size, layout="constrained")
     _maps(figure, cell, visited(model, cell, records), maps)
     return figure
+
+
+def _learned(cell: LFRCell) -> LFRCell:
+    """A cell with the map that is learned beside a known model alone; any other as it is."""
+    parts = known_parts(cell.static)
+    if parts is None or parts[1] is None:
+        return cell
+    own, learned = parts
+    sizes = cell.nu, cell.ny, cell.nx, cell.nz - own.nz, cell.nw - own.nw
+    return LFRCell(*sizes, learned, dtype=torch.float64)
 
 
 def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | None) -> _Visited:
@@ -99,7 +110,7 @@ def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | No
     else:
         signals = as_records(records)
     z = np.concatenate([model.signals(one).z[0].double().numpy() for one in signals])
-    z = z[:: 1 + len(z) // 20_000]
+    z = z[:: 1 + len(z) // 20_000, z.shape[1] - cell.nz :]  # of what is learned, the last
     if not np.isfinite(z).all():
         raise InputError(
             "the model diverges on the records; give others." if records is not None else

@@ -12,6 +12,7 @@ import torch
 import lfrtorch
 from lfrtorch import Dataset, InputError, Known, Parameter, Record, Settings, State
 from lfrtorch.analysis import PhysicalParameters, canonical, physical_parameters, uncertainty
+from lfrtorch.analysis.model_plots import static_figure
 from lfrtorch.engine.nonlinearity import known_parts
 from lfrtorch.fitting.known_start import known_model, varied
 
@@ -158,6 +159,12 @@ def test_other_features_work_with_it(settings: dict[str, Any]):
     train = record(drag=0.1)
     run = identified(train, starts=1, **settings)
     assert lfrtorch.rmse(train, run.model.simulate(train)) < 0.3 * np.std(train.y)
+
+
+def test_a_figure_of_the_map_is_of_what_is_learned(both: lfrtorch.Run, grey: lfrtorch.Run):
+    titles = [ax.get_title() for ax in static_figure(both.model, record(drag=0.3)).axes]
+    assert [title[:3] for title in titles if title] == ["w1:"]
+    assert len([ax for ax in static_figure(grey.model).axes if ax.get_title()]) == 3
 
 
 def test_it_is_refitted_with_validation_and_has_bands_and_a_canonical_form(both: lfrtorch.Run):
