@@ -169,6 +169,7 @@ class Model:
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{name}={size}" for name, size in self.sizes.items())
+        sizes = f"{self.known_states} known states, {sizes}" if self.known_states else sizes
         return f"Model({listed(self.inputs)} -> {listed(self.outputs)}, {self.fs:g} Hz, {sizes})"
 
     def __str__(self) -> str:
@@ -177,19 +178,22 @@ class Model:
         systems, rest = {"": linear_part(cell).physical(scaler)}, ""
         if cell.static is not None:
             x = equilibrium(cell, offset)
-            systems = {"linear part": systems[""]}
+            systems = {} if self.known_states else {"linear part": systems[""]}
             if x is None:
                 rest = "none found at the inputs' offsets"
             else:
                 systems["at rest"] = linearised_at(cell, offset, x).physical(scaler)
         sizes = ", ".join(f"{name} {size}" for name, size in self.sizes.items())
+        sizes = f"{self.known_states} known states, {sizes}" if self.known_states else sizes
         counts = f"{self.parameter_count} parameters, {self.net_parameter_count} net"
+        maps = [*cell.static.parts] if isinstance(cell.static, DirectSum) else [cell.static]
         facts = [
             ("sampled at", f"{self.fs:g} Hz"),
             ("inputs", levels(self.inputs, scaler.u_offset, scaler.u_scale)),
             ("outputs", levels(self.outputs, scaler.y_offset, scaler.y_scale)),
             ("sizes", f"{sizes}; {counts}"),
-            ("static map", "" if cell.static is None else str(cell.static).split("\n")[0]),
+            ("static map", "" if cell.static is None else str(maps[0]).split("\n")[0]),
+            *(("beside it", str(one)) for one in maps[1:]),
             ("fitted to", self.fitted_to),
             ("noise", "" if self.K is None else "innovation form: model.predict, model.observer"),
             ("rest", rest),
@@ -197,7 +201,7 @@ class Model:
         lines = [
             f"{'Linear' if cell.static is None else 'NL-LFR'} model",
             *in_columns(facts),
-            *system_lines(systems, self.fs, self.inputs, self.outputs),
+            *(system_lines(systems, self.fs, self.inputs, self.outputs) if systems else []),
         ]
         return "\n".join(lines)
 

@@ -161,6 +161,13 @@ def test_other_features_work_with_it(settings: dict[str, Any]):
     assert lfrtorch.rmse(train, run.model.simulate(train)) < 0.3 * np.std(train.y)
 
 
+def test_it_is_printed_with_its_parameters(both: lfrtorch.Run, grey: lfrtorch.Run):
+    assert "2 known states, nx=0" in repr(both.model)
+    assert "KnownMap(angle, speed; damping=" in str(both.model)
+    assert "beside it   Network(nz=1, nw=1, nn=4" in str(both.model)
+    assert "linear part" not in str(grey.model)
+
+
 def test_a_figure_of_the_map_is_of_what_is_learned(both: lfrtorch.Run, grey: lfrtorch.Run):
     titles = [ax.get_title() for ax in static_figure(both.model, record(drag=0.3)).axes]
     assert [title[:3] for title in titles if title] == ["w1:"]
