@@ -374,12 +374,12 @@ def _directions(
     scale = torch.linalg.vector_norm(J, dim=0)
     scale[scale == 0] = 1.0
     U, s, Vh = torch.linalg.svd(J / scale, full_matrices=False)
-    least = _TRUNCATION * s[0]
+    least = _TRUNCATION * (s[0] if s[0] > 0 else 1.0)  # 0: no parameter matters
     seen = s.clamp_min(least)
     step, cost = float((U.mT @ r)[s >= least].square().sum()), float(r.square().sum())
     rank = int((s >= least).sum())
     variance = (cost - step) / (samples - rank)
-    left = math.sqrt(step / (rank * variance)) if variance > ROUNDING**2 else 0.0
+    left = math.sqrt(step / (max(rank, 1) * variance)) if variance > ROUNDING**2 else 0.0
     return (Vh.mT / seen) / scale.unsqueeze(-1), s / seen, (left, step / cost if cost else 0.0)
 
 

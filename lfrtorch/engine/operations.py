@@ -81,9 +81,14 @@ class Symbol:
     @classmethod
     def __torch_function__(
         cls, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
-    ) -> Symbol:
+    ) -> Symbol | tuple[Any, ...]:
         """Write down a function of torch."""
-        table = next(one.table for one in _flat((*args, *(kwargs or {}).values())))
+        if func.__name__ == "stack" and len(args) == 1 and not kwargs:
+            return tuple(args[0])  # as the results of a function
+        given = _flat((*args, *(kwargs or {}).values()))
+        if not given:
+            raise UntraceableError(f"it calls {func.__name__} with a list; use single numbers.")
+        table = given[0].table
         return _row(table, func.__name__, args, kwargs or {})
 
     def __getattr__(self, name: str) -> Callable[..., Symbol]:
@@ -99,6 +104,9 @@ class Symbol:
     __lt__, __le__, __gt__, __ge__ = map(_operator, ("lt", "le", "gt", "ge"))
     __and__, __or__, __invert__ = map(_operator, ("and", "or", "not"))
     __neg__, __abs__ = _operator("neg"), _operator("abs")
+
+    def __repr__(self) -> str:
+        return "<a number>"
 
     def constant(self, value: float) -> Symbol:
         """A number in the same table."""

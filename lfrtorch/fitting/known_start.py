@@ -28,7 +28,7 @@ from lfrtorch.fitting.driven_states import relaxation_frequencies
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Stage
-from lfrtorch.fitting.trainer import StoppedError
+from lfrtorch.fitting.trainer import StartDivergesError, StoppedError
 from lfrtorch.known import Known
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.model import LinearModel
@@ -200,14 +200,21 @@ def known_starts(stage: Stage, linear: LinearModel) -> tuple[Settings, list[Mode
         options["trainer"] = LevenbergMarquardt(max_iter=_ITERATIONS)
         monitor = observer.searching()
         begun = count if grey else _STARTS
-        result = fit(
-            [model, *(varied(model, settings.seed + n) for n in range(1, begun))],
-            dataset.train,
-            dataset.validation,
-            dataset.selection,
-            monitors=None if monitor is None else [[monitor]] * begun,
-            **options,
-        )
+        try:
+            result = fit(
+                [model, *(varied(model, settings.seed + n) for n in range(1, begun))],
+                dataset.train,
+                dataset.validation,
+                dataset.selection,
+                monitors=None if monitor is None else [[monitor]] * begun,
+                **options,
+            )
+        except StartDivergesError:
+            raise StartDivergesError(
+                "the known model diverges on the training records, with the parameters that are "
+                "given and with others near them.\nGive values with which it is stable, start "
+                "states near (State(rest=...)), or more steps in a sample (substeps=10)."
+            ) from None
         if result.reason in CUT_SHORT:
             raise StoppedError("stopped during the fit to the parameters of the known model")
         model = result.model

@@ -83,6 +83,8 @@ class Settings(PlainSettings):
                 f"trainer is {self.trainer!r}; give lfrtorch.LevenbergMarquardt() or "
                 "lfrtorch.Adam()."
             )
+        if not isinstance(self.known, Known | None):
+            raise InputError(f"known is {self.known!r}; give an lfrtorch.Known.")
         if self.known is not None:
             self._complete_known(self.known)
         if self.init_from is None and self.nx is None:

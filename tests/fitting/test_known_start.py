@@ -226,6 +226,14 @@ def test_starts_vary_within_the_bounds():
             "returns 1 values; give 2",
         ),
         (
+            lambda: Known(lambda x, u, p: (u * x.a,), states=["a"]).equations(1, 1),
+            r"it uses \(<a number>,\), which is no single number",
+        ),
+        (
+            lambda: Known(lambda x, u, p: torch.cat([x.a, x.a]), states=["a"]).equations(1, 1),
+            "it calls cat with a list; use single numbers",
+        ),
+        (
             lambda: Known(lambda x, u, p: (x.b,), states=["a"]).equations(1, 1),
             "f of the known model fails: .*has no attribute 'b'",
         ),
@@ -240,9 +248,24 @@ def test_what_cannot_be_is_refused(make: Any, message: str):
         make()
 
 
+def test_a_parameter_that_does_not_matter_has_no_error():
+    idle = Known(lambda x, u, p: (u[0] - x.a,), states=["a"], parameters={"k": 5.0})
+    run = identified(record(0.0), known=idle, nn=0)
+    assert run.parameters is not None
+    assert run.parameters.values.tolist() == [5.0]
+    assert any("tell 0 of 1 directions" in note for note in run.parameters.notes)
+
+
+def test_equations_that_run_away_are_refused_with_what_may_help():
+    stiff = Known(lambda x, u, p: (u[0] - p.k * x.a,), states=["a"], parameters={"k": 500.0})
+    with pytest.raises(InputError, match=r"the known model diverges .*\n.*substeps=10"):
+        identified(record(0.0), known=stiff, nn=0)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        ({"known": "pendulum"}, "known is 'pendulum'; give an lfrtorch.Known"),
         ({"nz": 1, "nw": 1, "nn": 2, "ridge": "auto"}, "beside a known model none is searched"),
         ({"nz": 1, "nw": 1, "nn": 2, "noise": "innovation"}, "known is"),
         ({"nz": 1, "nw": 1, "nn": 2, "init": "paper"}, "known is"),
