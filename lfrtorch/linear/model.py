@@ -541,8 +541,14 @@ def _range(M: Array, limit: float) -> tuple[Array, int]:
 
 
 def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
-    """Return T and T⁻¹ to balanced coordinates, by the square-root method (Laub et al. 1987)."""
-    Lp, Lq = _square_root(_gramian(A, B @ B.T)), _square_root(_gramian(A.T, C.T @ C))
+    """Return T and T⁻¹ to balanced coordinates, by the square-root method (Laub et al. 1987).
+
+    An unstable system has none, and keeps its own.
+    """
+    controllable, observable = _gramian(A, B @ B.T), _gramian(A.T, C.T @ C)
+    if controllable is None or observable is None:
+        return np.eye(len(A)), np.eye(len(A))
+    Lp, Lq = _square_root(controllable), _square_root(observable)
     U, s, Vh = np.linalg.svd(Lq.T @ Lp)
     if not s.any():  # no input reaches an output: all coordinates are balanced
         return np.eye(len(A)), np.eye(len(A))
@@ -551,17 +557,26 @@ def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
     return (U / root).T @ Lq.T, Lp @ (Vh.T / root)
 
 
-def _gramian(A: Array, Q: Array) -> Array:
+_DOUBLINGS = 60
+"""Poles nearer to the unit circle than rounding have not ended then."""
+
+
+def _gramian(A: Array, Q: Array) -> Array | None:
     """P = A P Aᵀ + Q by Smith's doubling.
 
     scipy's solver forms I - A ⊗ A, which is singular to rounding if two poles are close to the unit
-    circle; the sum of A^k Q A^kᵀ stays positive semidefinite there.
+    circle; the sum of A^k Q A^kᵀ stays positive semidefinite there. None if rounding puts a pole on
+    or beyond the circle.
     """
-    P = Q
-    while np.abs(A).max() > np.finfo(float).eps:
+    P, eps = Q, np.finfo(float).eps
+    for _ in range(_DOUBLINGS):
+        if np.abs(A).max() <= eps:
+            return P
+        if np.abs(A).max() >= 1.0 / eps:
+            break
         P = P + A @ P @ A.T
         A = A @ A
-    return P
+    return None
 
 
 def _square_root(gramian: Array) -> Array:

@@ -711,3 +711,49 @@ def test_settings_that_cannot_be_are_one_message(
     assert stop.value.code == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "metrics.json").exists()
+
+
+KNOWN = """
+import lfrtorch
+
+
+def model():
+    return lfrtorch.Known(
+        lambda x, u, p: (p.gain * u[0] - p.rate * x.level,),
+        states=["level"],
+        parameters={"gain": 1.0, "rate": lfrtorch.Parameter(0.5, low=0.0, unit="1/s")},
+    )
+"""
+
+
+@pytest.mark.numeric
+def test_a_known_model_stands_in_the_working_directory(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, undrawn: None
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place != str(tmp_path)])
+    (tmp_path / "level_of_a_tank.py").write_text(KNOWN)
+    u, level, rows = np.random.default_rng(0).standard_normal(300), 0.0, ["u,y"]
+    for value in u:
+        rows.append(f"{value},{level}")
+        level += (2.0 * value - 0.8 * level) * (1 - np.exp(-0.08)) / 0.8
+    (tmp_path / "x.csv").write_text("\n".join(rows))
+    words = "data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=10 figures=false"
+    known = "known._target_=level_of_a_tank.model", "hydra.run.dir=run"
+    launched(monkeypatch, *words.split(), *known)
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    found = metrics["known"]["values"]
+    assert found["gain"]["value"] == pytest.approx(2.0, rel=1e-2)
+    assert found["rate"]["value"] == pytest.approx(0.8, rel=1e-2)
+    assert found["rate"]["unit"] == "1/s"
+    launched(monkeypatch, *words.split(), known[0], "nn=2", "hydra.run.dir=again", "overwrite=true")
+    sizes = json.loads((tmp_path / "again" / "metrics.json").read_text())["sizes"]
+    assert sizes == {"nx": 0, "nz": 2, "nw": 1, "nn": 2}
+
+
+@pytest.mark.numeric
+def test_entries_are_given_on_the_command_line():
+    cfg = configuration("nx=2", "data=file")
+    cfg.fixed = {"Cy": [[1.0, None]]}
+    fixed = config.configured(cfg).fixed["Cy"]
+    np.testing.assert_array_equal(fixed, [[1.0, np.nan]])

@@ -357,6 +357,13 @@ def test_balancing_close_to_the_unit_circle():
     np.testing.assert_allclose(G, expected, rtol=0, atol=1e-7)
 
 
+@pytest.mark.parametrize("pole", [1.0, 1.0 + 1e-15, 1.5])
+def test_balancing_on_and_beyond_the_unit_circle_changes_nothing(pole: float):
+    A, B, C = np.diag([pole, 0.5]), np.ones((2, 1)), np.array([[1.0, 2.0]])
+    for matrix in balancing(A, B, C):
+        np.testing.assert_array_equal(matrix, np.eye(2))
+
+
 def test_balancing_states_that_no_input_reaches_changes_nothing():
     A, C = np.diag([0.5, 0.2]), np.ones((1, 2))
     for matrix in balancing(A, np.zeros((2, 1)), C):
