@@ -55,7 +55,8 @@ nitpick_ignore_regex = [
     ("py:class", r"\w+"),  # an alias, or a type variable
     ("py:class", r"lfrtorch\.distributed\.Shared"),
     # what the engine's own functions hand each other
-    ("py:class", r"lfrtorch\.engine\..*\.(Activation|Kernel|Matrices|StaticJacobian)"),
+    ("py:class", r"lfrtorch\.engine\..*\.(Activation|Kernel|Matrices|StaticJacobian|Symbol)"),
+    ("py:class", r"lfrtorch\.engine\.known_map\..*"),
 ]
 
 # To other sites: `make docs-links`.
