@@ -19,6 +19,7 @@ from numba import config
 import lfrtorch
 from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.direct_sum import DirectSum
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.engine.simulation_kernel import simulate_record
@@ -26,6 +27,21 @@ from lfrtorch.extended_kalman_filter import NoiseCovariance
 
 MANY_STATES = 9
 """Rows of so many states go through other kernels."""
+
+
+def known(draw: random.Random, ny: int) -> lfrtorch.Known:
+    """Two states and a parameter, in one of the integrations."""
+    method: Any = draw.choice(["rk4", "euler", "discrete"])
+    discrete = method == "discrete"
+    return lfrtorch.Known(
+        lambda x, u, p: (0.1 * torch.sin(x.a) + 0.1 * u[-1], p.c * x.a - 0.5 * x.b),
+        states=["a", "b"],
+        parameters={"c": 0.2},
+        outputs=lambda x, u, p: [x.b + 0.1 * u[0]] * ny,
+        method=method,
+        substeps=1 if discrete else draw.randint(1, 3),
+        intersample="zoh" if discrete else draw.choice(["zoh", "bl"]),
+    )
 
 
 def model(draw: random.Random) -> lfrtorch.Model:
@@ -41,6 +57,10 @@ def model(draw: random.Random) -> lfrtorch.Model:
         ]
     )
     nz, nw = (nz, nw) if static else (0, 0)
+    if isinstance(static, lfrtorch.Network) and dtype == torch.float64 and draw.random() < 0.5:
+        own = known(draw, ny).map(nu, ny, 1.0)
+        static = DirectSum([own, static], [(own.nz, own.nw), (nz, nw)])
+        nx, nz, nw = max(nx, 2), own.nz + nz, own.nw + nw
     cell = LFRCell(nu, ny, nx, nz, nw, static, dtype=dtype)
     generator = torch.Generator().manual_seed(draw.randrange(1 << 30))
     with torch.no_grad():
