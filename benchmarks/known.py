@@ -39,8 +39,11 @@ TANKS = (
     ("softplus", 0, 0.0), ("softplus", 8, 10.0), ("softplus", 8, 100.0), ("softplus", 8, 1000.0),
     ("tanh", 8, 10.0), ("tanh", 8, 100.0), ("softplus", 15, 30.0), ("softplus", 15, 300.0),
 )  # fmt: skip
-EMPS = ((0, None), (4, None), (15, None), (0, 3000), (4, 3000))
-"""Neurons, and samples of a window."""
+EMPS = (
+    (0, None, 0.0), (4, None, 10.0), (15, None, 10.0), (0, 3000, 0.0), (4, 3000, 1.0),
+    (4, 3000, 10.0), (4, 3000, 100.0),
+)  # fmt: skip
+"""Neurons, samples of a window, and ridges."""
 
 
 def main() -> int:
@@ -124,18 +127,18 @@ def axis(root: Path) -> None:
     (whole,) = emps.load(root=root).train
     half = len(whole.u) // 2
     halves = whole[:half], whole[half : 2 * half]
-    print("| neurons | window | other half, mm | training, mm |\n" + "|---" * 4 + "|")
-    for nn, window in EMPS:
+    print("| neurons | window | ridge | other half, mm | training, mm |\n" + "|---" * 5 + "|")
+    for nn, window, ridge in EMPS:
         found, fitted = [], []
         for train, other in (halves, halves[::-1]):
-            settings: dict[str, Any] = {"nn": nn, "nz": 1, "nw": 1, "ridge": 10.0, "starts": 3}
+            settings: dict[str, Any] = {"nn": nn, "nz": 1, "nw": 1, "ridge": ridge, "starts": 3}
             settings |= {"horizon": window, "trainer": LevenbergMarquardt(max_iter=60)}
             run = identified([train], known=emps_model(), **settings)
             judged = replace(other, start="estimated", skip=20)
             found.append(1e3 * lfrtorch.rmse(judged, run.model.simulate(judged)))
             fitted.append(1e3 * run.fit.history[run.fit.chosen_iteration].train)
         cells = [", ".join(f"{error:.2f}" for error in errors) for errors in (found, fitted)]
-        print(f"| {nn} | {window or 'none'} | {cells[0]} | {cells[1]} |", flush=True)
+        print(f"| {nn} | {window or 'none'} | {ridge:g} | {cells[0]} | {cells[1]} |", flush=True)
 
 
 def speed() -> None:

@@ -24,7 +24,7 @@ from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.exclusions import allowed
 from lfrtorch.fitting.first_fit import begun_on_part, part_of
-from lfrtorch.fitting.given_entries import with_given
+from lfrtorch.fitting.given_entries import checked, shapes, with_given
 from lfrtorch.fitting.known_start import known_starts
 from lfrtorch.fitting.last_fits import distilled, refitted, without_poor_starts
 from lfrtorch.fitting.multistart import cheap_starts, fit
@@ -131,6 +131,10 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     dataset, settings, observer = given.dataset, given.settings, given.observer
     if settings.init_from is not None:
         check_channels(settings.init_from, dataset.train[0])
+    if settings.fixed:
+        nu, ny = len(dataset.train[0].inputs), len(dataset.train[0].outputs)
+        nx, nz, nw = (cast(int, size) for size in (settings.nx, settings.nz, settings.nw))
+        checked(settings.fixed, shapes(nx, nu, ny, nz, nw))
     dataset = dataset.with_windows()
     stage = replace(given, dataset=dataset)
     linearly = of_linear_model(settings)

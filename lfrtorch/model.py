@@ -287,14 +287,16 @@ class Model:
         nx² for the coordinates of x, nz² and nw² for those of z and w (a network and a polynomial
         absorb them), max(0, nw - ny) for a constant w that hides in the origin of the state, and
         nz nw for the linear terms of a polynomial, which A, Bu, Cy and Dyu hold as well. States in
-        two halves have coordinates of their own, and branches scales alone. Where only n < nz
+        two halves have coordinates of their own, and branches scales alone; an entry that is given
+        takes one direction of x. Where only n < nz
         signals enter z (the inputs, or the states without feedthrough), the map is one of n.
         """
         cell = self.lfr.cell
         halves = 2 if cell.structure in IN_SERIES else 1
         z_free, y_free = not _zero(cell.Dzu), not _zero(cell.Dyu)
         predicting = cell.past_outputs * (cell.nz * z_free + cell.ny * y_free)  # its zeros
-        gauge = cell.nx**2 // halves + predicting
+        given = sum(int(m.sum()) for n, m in cell.fixed.items() if n not in ("Dzu", "Dyu", "Dyw"))
+        gauge = max(0, cell.nx**2 // halves - given) + predicting
         if cell.structure == "parallel":
             return self.parameter_count - gauge - cell.nz - cell.nw
         static = base_of(cell.static)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lfrtorch.engine.simulation_kernel import affine, static_map
+from lfrtorch.engine.simulation_kernel import advance, affine, static_map
 
 DISCRETE, EULER, RK4 = range(3)
 """Numbers of the integrations in compiled code."""
@@ -165,19 +165,5 @@ def simulate_known_record(
         if len(Ww):
             static_map(WzT, Ww, bz, bw, activation, growth, z[k, first:], neurons, w[k, last:])
         affine(Cy, x[k], Dyu, u[k], y[k])
-        for i in range(len(Dyw)):
-            for j in range(w.shape[1]):
-                y[k, i] += Dyw[i, j] * w[k, j]
-        met = True
-        for i in range(len(A)):
-            a = 0.0
-            for j in range(len(A)):
-                a += A[i, j] * x[k, j]
-            for j in range(u.shape[1]):
-                a += Bu[i, j] * u[k, j]
-            for j in range(w.shape[1]):
-                a += Bw[i, j] * w[k, j]
-            met = met and abs(a - x[k + 1, i]) <= met_within * (1.0 + abs(a))
-            x[k + 1, i] = a
-        if met:
+        if advance(A, Bu, Bw, Dyw, x[k], u[k], w[k], met_within, y[k], x[k + 1]):
             return

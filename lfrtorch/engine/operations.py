@@ -164,6 +164,10 @@ def _row(
     return _appended(table, Operation(name, rows))
 
 
+def _applied(table: list[Operation], name: str, *operands: Any) -> Symbol:
+    return _row(table, name, operands)
+
+
 def _symbol(table: list[Operation], part: Any) -> Symbol:
     """A symbol as it is, and any number as a constant."""
     if isinstance(part, Symbol):
@@ -244,8 +248,7 @@ class Formula(NamedTuple):
     def of_symbols(self, v: Sequence[Symbol]) -> list[Symbol]:
         """w of symbols: the rows become rows of their table."""
         table = v[0].table
-        operations = {name: partial(_row, table, name) for name in OPERATIONS}
-        apply = {name: (lambda *v, own=own: own(v)) for name, own in operations.items()}
+        apply = {name: partial(_applied, table, name) for name in OPERATIONS}
         return [_symbol(table, w) for w in self.evaluated(v, apply, partial(_symbol, table))]
 
     def described(self) -> dict[str, Any]:

@@ -33,23 +33,29 @@ def simulate_record(
         affine(Cz, x[k], Dzu, u[k], z[k])
         static_map(WzT, Ww, bz, bw, activation, growth, z[k], h, w[k])
         affine(Cy, x[k], Dyu, u[k], y[k])
-        for i in range(len(Dyw)):
-            for j in range(w.shape[1]):
-                y[k, i] += Dyw[i, j] * w[k, j]
-        met = True
-        for i in range(len(A)):
-            a = u.dtype.type(0)
-            for j in range(len(A)):
-                a += A[i, j] * x[k, j]
-            for j in range(u.shape[1]):
-                a += Bu[i, j] * u[k, j]
-            for j in range(w.shape[1]):
-                a += Bw[i, j] * w[k, j]
-            # What stood there is the other trajectory, or NaN, which nothing meets.
-            met = met and abs(a - x[k + 1, i]) <= met_within * (1.0 + abs(a))
-            x[k + 1, i] = a
-        if met:
+        if advance(A, Bu, Bw, Dyw, x[k], u[k], w[k], met_within, y[k], x[k + 1]):
             return
+
+
+@njit(nogil=True, inline="always")
+def advance(A, Bu, Bw, Dyw, x, u, w, met_within, y, x_next):
+    """Add Dyw w to y, write the next state; whether it meets the one that stood there."""
+    for i in range(len(Dyw)):
+        for j in range(len(w)):
+            y[i] += Dyw[i, j] * w[j]
+    met = True
+    for i in range(len(A)):
+        a = u.dtype.type(0)
+        for j in range(len(A)):
+            a += A[i, j] * x[j]
+        for j in range(len(u)):
+            a += Bu[i, j] * u[j]
+        for j in range(len(w)):
+            a += Bw[i, j] * w[j]
+        # What stood there is the other trajectory, or NaN, which nothing meets.
+        met = met and abs(a - x_next[i]) <= met_within * (1.0 + abs(a))
+        x_next[i] = a
+    return met
 
 
 @njit(nogil=True, inline="always")

@@ -210,7 +210,8 @@ def _static_map(static: Module | None, own: bool) -> Network | Polynomial | Own 
         return Own(deepcopy(static).to(device="cpu", dtype=torch.float64).eval())
     raise InputError(
         f"the static map is a {type(static).__name__}, a class of your own, whose equations are "
-        "not known; a Network or a Polynomial can be exported, and your class to onnx alone."
+        "not known.\nA Network, a Polynomial or a known model can be exported, and your class to "
+        "onnx alone."
     )
 
 

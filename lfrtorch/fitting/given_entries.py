@@ -53,28 +53,17 @@ def with_given(model: Model, given: Given) -> tuple[Model, float]:
         "Bu": (one, s.u_scale), "Dzu": (one, s.u_scale), "Cy": (1 / s.y_scale, one),
         "Dyu": (1 / s.y_scale, s.u_scale), "Dyw": (1 / s.y_scale, one),
     }  # fmt: skip
-    wanted: dict[str, Array] = {}
-    for name, value in given.items():
-        if name not in Matrices._fields:
-            raise InputError(
-                f"fixed names '{name}'; the matrices are {', '.join(Matrices._fields)}."
-            )
-        shape, matrix = tuple(cell.get_parameter(name).shape), reals(f"fixed {name}", value)
-        if matrix.shape != shape:
-            raise InputError(
-                f"fixed {name} has the shape {matrix.shape}; the model's has {shape}, with NaN for "
-                "entries that are free."
-            )
-        if np.isinf(matrix).any() or not np.isfinite(matrix).any():
-            raise InputError(
-                f"fixed {name} is {matrix.tolist()}; give some finite numbers and NaN."
-            )
+    wanted = {}
+    sizes = cell.nx, cell.nu, cell.ny, cell.nz, cell.nw
+    for name, matrix in checked(given, shapes(*sizes)).items():
         rows, columns = units.get(name, (one, one))
         wanted[name] = matrix * rows[:, None] * columns
     own = {name: p.detach().double().cpu().numpy() for name, p in cell.named_parameters()}
-    found = transformed(own, coordinates(own, wanted))
-    worst = 0.0
+    T = coordinates(own, wanted)
+    found, worst = transformed(own, T), 0.0
     with torch.no_grad():
+        moved = torch.as_tensor(T).to(cell.state_covariance)
+        cell.state_covariance.copy_(moved @ cell.state_covariance @ moved.mT)
         for name in Matrices._fields:
             cell.get_parameter(name).copy_(torch.as_tensor(found[name]))
         for name, matrix in wanted.items():
@@ -84,6 +73,36 @@ def with_given(model: Model, given: Given) -> tuple[Model, float]:
             p[torch.as_tensor(mask)] = torch.as_tensor(matrix[mask]).to(p)
             cell.fix(name, torch.as_tensor(mask))
     return replace(model, lfr=type(model.lfr)(cell)), worst
+
+
+def shapes(nx: int, nu: int, ny: int, nz: int, nw: int) -> dict[str, tuple[int, int]]:
+    """Shapes of the matrices."""
+    into, of = {"A": nx, "Bu": nu, "Bw": nw}, {"Cz": nz, "Cy": ny}
+    found = {name: (nx, size) for name, size in into.items()}
+    found |= {name: (size, nx) for name, size in of.items()}
+    return found | {"Dzu": (nz, nu), "Dyu": (ny, nu), "Dyw": (ny, nw)}
+
+
+def checked(given: Given, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Array]:
+    """The matrices as arrays; refuse those that a model of these shapes has not."""
+    found = {}
+    for name, value in given.items():
+        if name not in Matrices._fields:
+            raise InputError(
+                f"fixed names '{name}'; the matrices are {', '.join(Matrices._fields)}."
+            )
+        matrix = reals(f"fixed {name}", value)
+        if matrix.shape != shapes[name]:
+            raise InputError(
+                f"fixed {name} has the shape {matrix.shape}; the model's has {shapes[name]}, with "
+                "NaN for entries that are free."
+            )
+        if np.isinf(matrix).any() or not np.isfinite(matrix).any():
+            raise InputError(
+                f"fixed {name} is {matrix.tolist()}; give some finite numbers and NaN."
+            )
+        found[name] = matrix
+    return found
 
 
 def transformed(own: Mapping[str, Array], T: Float[Array, "nx nx"]) -> dict[str, Array]:

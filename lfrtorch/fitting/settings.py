@@ -107,6 +107,11 @@ class Settings(PlainSettings):
             for name, size in self.init_from.sizes.items():
                 object.__setattr__(self, name, size)
         refuse_together(**self._that_exclude())
+        if self.fixed and (self.searched or self.nx == "auto"):
+            raise InputError(
+                "fixed gives entries of matrices whose sizes or ridge are auto; give the numbers "
+                "that a search without it has chosen."
+            )
         guarantee = getattr(self.trainer, "guarantee", None)
         if self.searched and guarantee not in (None, "stable"):
             raise InputError(

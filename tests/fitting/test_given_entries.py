@@ -10,7 +10,7 @@ import pytest
 from reference import measure, random_cell, random_model
 
 import lfrtorch
-from lfrtorch import Dataset, InputError, Record, Settings, initialise
+from lfrtorch import Dataset, InputError, Record, Settings, initialise, job
 from lfrtorch.fitting.given_entries import with_given
 
 NAN = float("nan")
@@ -47,6 +47,13 @@ def test_the_same_model_is_put_into_coordinates_that_have_the_entries(names: tup
     found, apart = with_given(model, given)
     assert apart < 1e-6
     u = measure(model, 50, seed=1).u
+    moment, T = (
+        model.state_covariance,
+        np.linalg.lstsq(model.signals(u).x[0].numpy(), found.signals(u).x[0].numpy(), rcond=None)[
+            0
+        ].T,
+    )
+    np.testing.assert_allclose(found.state_covariance, T @ moment @ T.T, rtol=1e-4, atol=1e-8)
     difference = found.simulate(u) - model.simulate(u)
     assert np.abs(difference).max() < 1e-5 * np.abs(model.simulate(u)).max()
     assert found.lfr.cell.Cy.tolist() == [[pytest.approx(1.0 / scale), 0.0]]
@@ -60,6 +67,8 @@ def test_a_fit_keeps_what_is_given_and_is_as_good(tmp_path: Path):
     assert cell.A[0].tolist() == [1.0, 0.1]
     assert cell.Bu[0].tolist() == [0.0]
     assert run.model.parameter_count == free.model.parameter_count - 5
+    # Four of the five entries are a choice of coordinates.
+    assert run.model.net_parameter_count == free.model.net_parameter_count - 1
     errors = [each.fit.history[each.fit.chosen_iteration].train for each in (run, free)]
     assert errors[0] < 1.1 * errors[1]
     other = oscillator(seed=3)
@@ -94,3 +103,19 @@ def test_what_is_no_matrix_is_refused(given: dict[str, Any], message: str):
     model = initialise(lfrtorch.estimate_bla(record, nx=2), record, nz=1, nw=1, nn=2)
     with pytest.raises(InputError, match=message):
         with_given(model, given)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"nx": "auto", "fixed": {"Cy": [[1.0, 0.0]]}}, "whose sizes or ridge are auto"),
+        ({"ridge": "auto", "fixed": {"Cy": [[1.0, 0.0]]}}, "whose sizes or ridge are auto"),
+        ({"fixed": {"Cy": [[1.0, 0.0, 0.0]]}}, r"the model's has \(1, 2\)"),
+    ],
+)
+def test_settings_are_refused_before_any_fit(
+    settings: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(job, "linear_model", None)
+    with pytest.raises(InputError, match=message):
+        identified(**settings)
