@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lfrtorch.engine.simulation_kernel import advance, affine, static_map
+from lfrtorch.engine.simulation_kernel import activate, affine, dot
 
 DISCRETE, EULER, RK4 = range(3)
 """Numbers of the integrations in compiled code."""
@@ -147,7 +147,8 @@ def simulate_known_record(
 ):  # fmt: skip
     """Simulate record r of a static map that is a known model and then a network or polynomial.
 
-    All else is as in ``simulation_kernel.simulate_record``.
+    All else is as in ``simulation_kernel.simulate_record``, and written again: in functions that
+    both call, the recurrence of a network takes 1.4 times as long.
     """
     u, x, z, w, y = u[r], x[r], z[r], w[r], y[r]
     neurons, work = np.empty(Ww.shape[1]), np.empty((5, len(of_z) + len(p) + len(of_w)))
@@ -163,7 +164,39 @@ def simulate_known_record(
         for i in range(last):
             w[k, i] = known_w[i]
         if len(Ww):
-            static_map(WzT, Ww, bz, bw, activation, growth, z[k, first:], neurons, w[k, last:])
+            _learned_map(WzT, Ww, bz, bw, activation, growth, z[k, first:], neurons, w[k, last:])
         affine(Cy, x[k], Dyu, u[k], y[k])
-        if advance(A, Bu, Bw, Dyw, x[k], u[k], w[k], met_within, y[k], x[k + 1]):
+        for i in range(len(Dyw)):
+            for j in range(w.shape[1]):
+                y[k, i] += Dyw[i, j] * w[k, j]
+        met = True
+        for i in range(len(A)):
+            a = 0.0
+            for j in range(len(A)):
+                a += A[i, j] * x[k, j]
+            for j in range(u.shape[1]):
+                a += Bu[i, j] * u[k, j]
+            for j in range(w.shape[1]):
+                a += Bw[i, j] * w[k, j]
+            met = met and abs(a - x[k + 1, i]) <= met_within * (1.0 + abs(a))
+            x[k + 1, i] = a
+        if met:
             return
+
+
+@njit(nogil=True, inline="always")
+def _learned_map(WzT, Ww, bz, bw, activation, growth, z, h, w):
+    """Write w of z, by way of the hidden layer h."""
+    if len(growth):
+        h[0] = 1.0
+        for n in range(len(growth)):
+            h[n + 1] = h[growth[n, 0]] * z[growth[n, 1]]
+    else:
+        for n in range(len(h)):
+            h[n] = bz[n]
+        for j in range(len(z)):
+            for n in range(len(h)):
+                h[n] += WzT[j, n] * z[j]
+        activate(activation, h)
+    for i in range(len(w)):
+        w[i] = bw[i] + dot(Ww[i], h)

@@ -31,49 +31,37 @@ def simulate_record(
     h = np.empty(Ww.shape[1], u.dtype)
     for k in range(len(u)):
         affine(Cz, x[k], Dzu, u[k], z[k])
-        static_map(WzT, Ww, bz, bw, activation, growth, z[k], h, w[k])
+        if len(growth):
+            h[0] = 1.0
+            for n in range(len(growth)):
+                h[n + 1] = h[growth[n, 0]] * z[k, growth[n, 1]]
+        else:
+            for n in range(len(h)):
+                h[n] = bz[n]
+            for j in range(z.shape[1]):
+                for n in range(len(h)):  # neighbours in memory
+                    h[n] += WzT[j, n] * z[k, j]
+            activate(activation, h)
+        for i in range(w.shape[1]):
+            w[k, i] = bw[i] + dot(Ww[i], h)
         affine(Cy, x[k], Dyu, u[k], y[k])
-        if advance(A, Bu, Bw, Dyw, x[k], u[k], w[k], met_within, y[k], x[k + 1]):
+        for i in range(len(Dyw)):
+            for j in range(w.shape[1]):
+                y[k, i] += Dyw[i, j] * w[k, j]
+        met = True
+        for i in range(len(A)):
+            a = u.dtype.type(0)
+            for j in range(len(A)):
+                a += A[i, j] * x[k, j]
+            for j in range(u.shape[1]):
+                a += Bu[i, j] * u[k, j]
+            for j in range(w.shape[1]):
+                a += Bw[i, j] * w[k, j]
+            # What stood there is the other trajectory, or NaN, which nothing meets.
+            met = met and abs(a - x[k + 1, i]) <= met_within * (1.0 + abs(a))
+            x[k + 1, i] = a
+        if met:
             return
-
-
-@njit(nogil=True, inline="always")
-def advance(A, Bu, Bw, Dyw, x, u, w, met_within, y, x_next):
-    """Add Dyw w to y, write the next state; whether it meets the one that stood there."""
-    for i in range(len(Dyw)):
-        for j in range(len(w)):
-            y[i] += Dyw[i, j] * w[j]
-    met = True
-    for i in range(len(A)):
-        a = u.dtype.type(0)
-        for j in range(len(A)):
-            a += A[i, j] * x[j]
-        for j in range(len(u)):
-            a += Bu[i, j] * u[j]
-        for j in range(len(w)):
-            a += Bw[i, j] * w[j]
-        # What stood there is the other trajectory, or NaN, which nothing meets.
-        met = met and abs(a - x_next[i]) <= met_within * (1.0 + abs(a))
-        x_next[i] = a
-    return met
-
-
-@njit(nogil=True, inline="always")
-def static_map(WzT, Ww, bz, bw, activation, growth, z, h, w):
-    """Write w of z, by way of the hidden layer h."""
-    if len(growth):
-        h[0] = 1.0
-        for n in range(len(growth)):
-            h[n + 1] = h[growth[n, 0]] * z[growth[n, 1]]
-    else:
-        for n in range(len(h)):
-            h[n] = bz[n]
-        for j in range(len(z)):
-            for n in range(len(h)):  # neighbours in memory
-                h[n] += WzT[j, n] * z[j]
-        activate(activation, h)
-    for i in range(len(w)):
-        w[i] = bw[i] + _dot(Ww[i], h)
 
 
 @njit(nogil=True, inline="always")
@@ -89,8 +77,8 @@ def affine(C, x, D, u, out):
 
 
 @njit(nogil=True, fastmath={"contract", "reassoc"})
-def _dot(a, b):
-    # Sums in any order become vector instructions; the states' sums keep theirs.
+def dot(a, b):
+    """Inner product; sums in any order become vector instructions, the states' sums keep theirs."""
     total = a.dtype.type(0)
     for n in range(len(a)):
         total += a[n] * b[n]
