@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.records import Record, signals
 from lfrtorch.score_window import with_window
 
@@ -59,6 +60,9 @@ class Dataset:
         seed: that simulated data were drawn with.
         groups: test or validation records that make one score together, by its name and theirs: the
             mean of the RMSE of each output of each record.
+        ahead: what is scored of predictions from measured starts, by name: functions of outputs
+            predicted and measured, (n, horizon, ny) each, that return errors (n, horizon); a score
+            is the sum over the horizon of their means.
         leaderboard: test records as nonlinearbenchmark.org has them scored: cut by the package
             nonlinear_benchmarks, the start state fitted to the samples that it leaves unscored.
 
@@ -87,6 +91,7 @@ class Dataset:
     leaderboard: list[Record] = field(default_factory=list)
     seed: int | None = None
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    ahead: Mapping[str, Callable[[Array, Array], Array]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for use in ("train", "validation", "tests", "selection", "leaderboard"):

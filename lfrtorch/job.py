@@ -24,6 +24,12 @@ from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.exclusions import allowed
 from lfrtorch.fitting.first_fit import begun_on_part, part_of
+from lfrtorch.fitting.from_outputs import (
+    begins_at_outputs,
+    begun_on_short_windows,
+    in_windows,
+    with_measured_states,
+)
 from lfrtorch.fitting.given_entries import checked, shapes, with_given
 from lfrtorch.fitting.known_start import known_starts
 from lfrtorch.fitting.last_fits import distilled, refitted, without_poor_starts
@@ -36,8 +42,10 @@ from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.stage import Stage
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.trainer import FitResult, Stop
+from lfrtorch.fitting.windows import windows
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
+from lfrtorch.linear.measured_states import measured_states_model
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan, scan_orders
 from lfrtorch.linear.requirements import excited_directions
@@ -138,10 +146,17 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     dataset = dataset.with_windows()
     stage = replace(given, dataset=dataset)
     linearly = of_linear_model(settings)
-    approximated = linear_records(dataset.train, linearly, observer)
-    linear, order_scan = linear_model(
-        approximated, linearly, dataset.validation, observer=observer, ranks=given.ranks
-    )
+    from_outputs = begins_at_outputs(dataset.train)
+    if from_outputs:
+        linear, order_scan = measured_states_model(dataset.train), None
+        tell(linear, observer)
+        settings = _of_outputs(settings, linear.nx)
+        stage = replace(stage, settings=settings)
+    else:
+        approximated = linear_records(dataset.train, linearly, observer)
+        linear, order_scan = linear_model(
+            approximated, linearly, dataset.validation, observer=observer, ranks=given.ranks
+        )
     begun = linear
     choice = None
     if settings.searched:
@@ -161,8 +176,12 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
         settings, models = known_starts(stage, linear)
     else:
         settings, models = starting_models(
-            dataset.train, settings, begun, observer, chosen=choice is not None
+            in_windows(stage), settings, begun, observer, chosen=choice is not None
         )
+        if from_outputs and settings.init_from is None:
+            stage = replace(stage, settings=settings)
+            models = [with_measured_states(model) for model in models]
+            settings, models = begun_on_short_windows(stage, models)
     if settings.fixed:
         found = [with_given(model, settings.fixed) for model in models]
         models = [model for model, _ in found]
@@ -206,6 +225,23 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     return scored_run(
         dataset, settings, linear, result, order_scan=order_scan, choice=choice, again=again
     )
+
+
+def _of_outputs(settings: Settings, ny: int) -> Settings:
+    """The settings of a model whose states are the outputs."""
+    if settings.searched:
+        raise InputError(
+            f"{', '.join(settings.searched)}: auto, and sizes are not searched with "
+            "start='measured' yet; give numbers."
+        )
+    if settings.known_states or settings.nx == ny:
+        return settings
+    if settings.nx != "auto":
+        raise InputError(
+            f"nx is {settings.nx}, and with start='measured' the {ny} outputs are the states; give "
+            f"nx={ny} or nx='auto'."
+        )
+    return replace(settings, nx=ny)
 
 
 def _all_estimation(dataset: Dataset) -> Dataset:
@@ -261,11 +297,14 @@ def scored_run(
         model=result.model,
         refitted=None if again is None else again.model,
         own=linear_models_of_tests(dataset, settings),
+        horizon=settings.horizon,
         left_out=() if choice is None else cross_validated(choice.left_out),
     )
     judged = simulations = evaluation.simulations
     if settings.noise == "output" or (choice is not None and not dataset.tests):
-        verdict = judge(result, simulations, linear_nx=linear.nx)
+        ahead = settings.horizon if begins_at_outputs(dataset.train) else None
+        error = "error" if ahead is None else f"error {ahead} samples ahead"
+        verdict = judge(result, simulations, linear_nx=linear.nx, error=error)
     else:
         one, some, _ = HORIZONS
         judged = evaluation.predictions[one]
@@ -293,6 +332,8 @@ def scored_run(
         if again is not None:
             of = all_records(dataset.train, [*dataset.validation, *dataset.selection])
         ridge = 0.0 if isinstance(settings.ridge, Mapping | str) else settings.ridge
+        if begins_at_outputs(of) and settings.horizon is not None:
+            of = windows(of, settings.horizon, model.lfr.cell.nx, y_scale=model.scaler.y_scale)
         known = physical_parameters((again or result).model, of, ridge=ridge)
     numbers = metrics(
         result,

@@ -89,3 +89,104 @@ def emps() -> Known:
             "offset": Parameter(0.0, scale=0.03, unit="m/s²"),
         },
     )
+
+
+_GRAVITY = 9.81
+"""Of the earth, m/s²."""
+
+_SAMPLE = 0.01
+"""Between two samples of the flights, s."""
+
+_THOUSAND = 1e-3
+"""Motor speeds enter in 1000 rad/s."""
+
+_HOVERING = 7.0
+"""Sum of the four at rest in the air, 1000 rad/s."""
+
+
+def nanodrone() -> Known:
+    """A rigid body with four propellers: position, velocity, roll, pitch and yaw, body rates.
+
+    The thrust along the body's vertical axis and the torques are sums of squares of the motor
+    speeds; the air damps speeds and rates, and its flow across the propellers turns the body. The
+    measured velocity is that of an estimator, so the position moves by a multiple of it. One step
+    of a sample takes the rates, and with them the attitude, at its middle.
+
+    References:
+        Mahony, Kumar and Corke, "Multirotor aerial vehicles: modeling, estimation, and control of
+        quadrotor", IEEE Robotics and Automation Magazine 19(3), 2012.
+    """
+
+    def sample(x, u, p):
+        motors = [_THOUSAND * speed for speed in u]
+        first, second, third, fourth = (motor * motor for motor in motors)
+        whole = first + second + third + fourth
+        linear = motors[0] + motors[1] + motors[2] + motors[3] - _HOVERING
+        sr, cr = torch.sin(x.roll), torch.cos(x.roll)
+        sp, cp = torch.sin(x.pitch), torch.cos(x.pitch)
+        sy, cy = torch.sin(x.yaw), torch.cos(x.yaw)
+        # Axes of the body in the room: ahead, to the left and up.
+        axes = (
+            (cy * cp, sy * cp, -sp),
+            (cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, cp * sr),
+            (cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr),
+        )
+        velocity = (x.vx, x.vy, x.vz)
+        ahead, aside, rising = (
+            sum(a * v for a, v in zip(axis, velocity, strict=True)) for axis in axes
+        )
+        forces = (
+            p.push_x + p.tilt_x * whole - p.drag * ahead,
+            p.push_y + p.tilt_y * whole - p.drag * aside,
+            p.thrust * whole + p.linear * linear - p.drag_z * rising,
+        )
+        torques = (
+            p.roll_gain * (third + fourth - first - second) + p.flow_x * aside
+            - p.damp_x * x.p + p.bias_x + p.gyro_x * x.q * x.r,
+            p.pitch_gain * (second + third - first - fourth) + p.flow_y * ahead
+            - p.damp_y * x.q + p.bias_y + p.gyro_y * x.p * x.r,
+            p.yaw_gain * (second + fourth - first - third)
+            - p.damp_z * x.r + p.bias_z + p.gyro_z * x.p * x.q,
+        )  # fmt: skip
+        old = (x.p, x.q, x.r)
+        rates = [rate + _SAMPLE * torque for rate, torque in zip(old, torques, strict=True)]
+        roll, pitch, yaw = (0.5 * (a + b) for a, b in zip(old, rates, strict=True))
+        turning = (sr * pitch + cr * yaw) / cp
+        angles = (
+            x.roll + _SAMPLE * (roll + sp * turning),
+            x.pitch + _SAMPLE * (cr * pitch - sr * yaw),
+            x.yaw + _SAMPLE * turning,
+        )
+        weight = (0.0, 0.0, _GRAVITY)
+        pull = [
+            sum(f * axis[i] for f, axis in zip(forces, axes, strict=True)) - weight[i]
+            for i in range(3)
+        ]
+        speeds = [v + _SAMPLE * a for v, a in zip(velocity, pull, strict=True)]
+        moves = [v + p.lead * a for v, a in zip(speeds, pull, strict=True)]
+        gains, places = (p.scale, p.scale, p.scale_z), (x.x, x.y, x.z)
+        places = [s + _SAMPLE * gain * v for s, gain, v in zip(places, gains, moves, strict=True)]
+        return (*places, *speeds, *angles, *rates)
+
+    free = {
+        "push_x": 0.1, "push_y": 0.1, "tilt_x": 0.02, "tilt_y": 0.02, "linear": 0.3, "lead": 0.02,
+        "flow_x": 3.0, "flow_y": 3.0, "bias_x": 1.0, "bias_y": 1.0, "bias_z": 1.0, "gyro_x": 0.3,
+        "gyro_y": 0.3, "gyro_z": 0.3,
+    }  # fmt: skip
+    begun = {
+        "scale": 1.0, "scale_z": 1.0, "thrust": 0.8, "drag": 0.5, "drag_z": 0.5, "roll_gain": 25.0,
+        "pitch_gain": 20.0, "yaw_gain": 4.0, "damp_x": 3.0, "damp_y": 3.0, "damp_z": 6.0,
+    }  # fmt: skip
+    units = {
+        "m": ("x", "y", "z"), "m/s": ("vx", "vy", "vz"), "rad": ("roll", "pitch", "yaw"),
+        "rad/s": ("p", "q", "r"),
+    }  # fmt: skip
+    return Known(
+        sample,
+        method="discrete",
+        states=[State(name, unit=unit) for unit, names in units.items() for name in names],
+        sees=["vx", "vy", "vz", "roll", "pitch", "p", "q", "r", "u"],
+        acts_on=["vx", "vy", "vz", "p", "q", "r"],
+        parameters={name: Parameter(0.0, scale=scale) for name, scale in free.items()}
+        | {name: Parameter(value) for name, value in begun.items()},
+    )

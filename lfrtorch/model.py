@@ -32,7 +32,7 @@ from lfrtorch.engine.disturbance import (
     drift_variance,
     tells_apart,
 )
-from lfrtorch.engine.initial_state import estimated_start
+from lfrtorch.engine.initial_state import estimated_start, measured_start
 from lfrtorch.engine.innovation import predictor_cell, split_predictor
 from lfrtorch.engine.known_map import KnownEquations, KnownMap
 from lfrtorch.engine.lfr import LFR
@@ -40,7 +40,7 @@ from lfrtorch.engine.linearised import static_slope
 from lfrtorch.engine.nonlinearity import Beyond, Network, Polynomial, base_of, known, known_parts
 from lfrtorch.engine.operating_point import double, equilibrium, linear_part, linearised_at
 from lfrtorch.engine.resampling import resampled_cell
-from lfrtorch.engine.simulation import Trajectory
+from lfrtorch.engine.simulation import Trajectory, simulate
 from lfrtorch.extended_kalman_filter import (
     ExtendedKalmanFilter,
     NoiseCovariance,
@@ -74,6 +74,9 @@ _STEPS, _HELD, _COMMON = 100, 20, 100
 """Of the input that compares a resampled model: steps, common samples of each, and the longest
 common sample, in samples."""
 
+_TOGETHER = 1000
+"""Predictions that are simulated at once."""
+
 _SCALING = ("u_offset", "u_scale", "y_offset", "y_scale")  # fields of a Scaler, in a checkpoint
 
 
@@ -84,6 +87,8 @@ def simulate_record(lfr: LFR, normalised: NormalisedRecord, start: Start) -> Tra
     u, y, weight = (torch.tensor(signal).to(like).unsqueeze(0) for signal in signals)
     if start == "estimated":
         return lfr.trajectory(u, estimated_start(lfr.cell, u, y, weight))
+    if start == "measured":
+        return lfr.trajectory(u, measured_start(lfr.cell, u[:, 0], y[:, 0]))
     return lfr.trajectory(u, None, start)
 
 
@@ -324,8 +329,9 @@ class Model:
         Args:
             data: a record, or an input in physical units.
             start: ``"zero"`` (x = 0: at rest at the input's offset, up to the network's bias),
-                ``"given"`` (x0), ``"periodic"``, or ``"estimated"``: from the most probable state,
-                given the record's output in the samples it skips, or in all if it skips none.
+                ``"given"`` (x0), ``"periodic"``, ``"measured"``: from the state that the record's
+                first output tells, or ``"estimated"``: from the most probable state, given the
+                record's output in the samples it skips, or in all if it skips none.
                 Default: the record's own, and ``"zero"`` for a bare input.
             x0: initial state in the model's coordinates, for ``start="given"``.
 
@@ -374,9 +380,9 @@ class Model:
             if not np.isfinite(given).all():
                 raise InputError("x0 has NaN, infinite or masked entries; give finite numbers.")
             state = torch.tensor(given).to(like).reshape(1, -1)
-        if start == "estimated":
+        if start in ("estimated", "measured"):
             if not isinstance(data, Record):
-                raise InputError("start='estimated' needs a record: the state is fitted to its y.")
+                raise InputError(f"start='{start}' needs a record: its y tells the state.")
             trajectory = simulate_record(self.lfr, self.scaler.normalise(data), start)
         else:
             trajectory = self.lfr.trajectory(v, state, start)
@@ -388,6 +394,8 @@ class Model:
 
         The prediction of a sample knows the inputs up to it, and the outputs up to ``horizon``
         samples before it. In the first samples, before which there are none, it is a simulation.
+        A model without K predicts from the output that far before alone, if that tells its states:
+        of records with a measured start.
 
         Args:
             record: inputs and measured outputs.
@@ -407,6 +415,10 @@ class Model:
         """
         integer("horizon", horizon, 1)
         self.check(record)
+        if self.K is None and record.start == "measured":
+            first = self.ahead(record[: horizon + 1], min(horizon, record.samples - 1))[0]
+            later = self.ahead(record, horizon)[:, -1] if record.samples > horizon else first[:0]
+            return record.shown(np.concatenate([record.y[:1], first[:-1], later]))
         states = self.predictor().signals(with_past_outputs(record)).x[0, :-1]
         cell, T = self.lfr.cell, record.samples
         u = torch.as_tensor(self.scaler.normalise_u(record.u)).to(cell.A)
@@ -416,6 +428,39 @@ class Model:
                 y[ahead:], after = cell(u[ahead:], x)
                 x = after[:-1]
         return record.shown(self.scaler.restore_y(y.double().cpu().numpy()))
+
+    def ahead(self, record: Record, horizon: int) -> Array:
+        """Outputs predicted 1 to ``horizon`` samples ahead of every sample, in physical units.
+
+        Each prediction begins in the state that the output of its sample tells, and knows the
+        inputs that follow.
+
+        Shape:
+            (T - horizon, horizon, ny), not finite where the model diverges.
+
+        Raises:
+            ValueError: a record that is no longer than the horizon, of other channels or rate.
+
+        Example:
+            >>> model.ahead(record, 5).shape
+            (395, 5, 1)
+        """
+        integer("horizon", horizon, 1)
+        self.check(record)
+        if record.samples <= horizon:
+            raise InputError(
+                f"record '{record.name}' has {record.samples} samples and horizon is {horizon}; "
+                "give a longer record or a shorter horizon."
+            )
+        cell, normalised = double(self.lfr.cell).cpu(), self.scaler.normalise(record)
+        u, y = (torch.as_tensor(signal) for signal in (normalised.u, normalised.y))
+        windows = u.unfold(0, horizon + 1, 1).mT
+        found = []
+        for first in range(0, len(windows), _TOGETHER):
+            part = windows[first : first + _TOGETHER].contiguous()
+            x0 = measured_start(cell, part[:, 0], y[first : first + len(part)])
+            found.append(simulate(cell, part, x0).y[:, 1:].numpy())
+        return self.scaler.restore_y(np.concatenate(found))
 
     @overload
     def observer(

@@ -17,7 +17,7 @@ from lfrtorch._support.checks import integer, number, reals
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array, Booleans
 
-Start = Literal["zero", "given", "estimated", "periodic"]
+Start = Literal["zero", "given", "estimated", "periodic", "measured"]
 
 _SMALLEST, _LARGEST = 1e-100, 1e100
 """Levels of a signal, and sampling frequencies, whose squares neither overflow nor vanish."""
@@ -64,7 +64,9 @@ class Record:
         start: ``"zero"`` simulates from x = 0 (near rest at the input's offset), ``"given"`` from
             ``x0``; ``"estimated"`` fits the start state, too: in a fit together with the
             parameters; in a simulation to the skipped samples alone, or to all if none is skipped;
-            ``"periodic"``: the record is a whole number of periods in steady state.
+            ``"measured"`` takes the states from the first output, which tells them, and states
+            that it does not tell are at rest; ``"periodic"``: the record is a whole number of
+            periods in steady state.
         skip: samples at the beginning that are left out of cost and score. Of an estimated start
             without it, a score leaves out the first 50, or the first fifth of a shorter record.
         x0: the given start state, in the coordinates of the model.
@@ -331,7 +333,10 @@ class Record:
         return len(self.u)
 
     def __getitem__(self, window: slice) -> Record:
-        """Return the part of the record in ``window``, from zero state with nothing skipped."""
+        """Return the part of the record in ``window``, from zero state with nothing skipped.
+
+        A part of a record whose start is measured has a measured start, too.
+        """
         if not isinstance(window, slice) or window.step not in (None, 1):
             raise InputError(f"a record is cut by record[first:last], not by {window!r}.")
         if self.line_weight is not None:
@@ -341,7 +346,8 @@ class Record:
             )
         part = self.signals_in(window)
         period = self.period if self.period is not None and self.period <= len(part["u"]) else None
-        return replace(self, **part, start="zero", skip=0, period=period, x0=None)
+        start = "measured" if self.start == "measured" else "zero"
+        return replace(self, **part, start=start, skip=0, period=period, x0=None)
 
     def mean_period(self) -> Record:
         """Return one period, the mean of all P of a record in steady state, with their weight.
@@ -523,7 +529,8 @@ def check_start(start: str, what: str) -> None:
     """Refuse an unknown kind of start with a ValueError."""
     if not isinstance(start, str) or start not in get_args(Start):
         raise InputError(
-            f"{what}: start is {start!r}; use 'zero', 'given', 'estimated' or 'periodic'."
+            f"{what}: start is {start!r}; use 'zero', 'given', 'estimated', 'measured' or "
+            "'periodic'."
         )
 
 

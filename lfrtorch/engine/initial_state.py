@@ -81,6 +81,17 @@ def start_from_beginning(
 
 
 @torch.no_grad()
+def measured_start(
+    cell: LFRCell, u: Float[Tensor, "R nu"], y: Float[Tensor, "R ny"]
+) -> Float[Tensor, "R nx"]:
+    """The state nearest to rest whose output is the measured one, or nearest to it."""
+    u, y = u.unsqueeze(1), y.unsqueeze(1)
+    rest = simulate(cell, u, u.new_zeros(len(u), cell.nx))
+    free = u.new_zeros(len(u), cell.nx, cell.nx)
+    return _fitted_start(cell, u, y, torch.ones_like(y), free, rest).x[:, 0]
+
+
+@torch.no_grad()
 def estimated_start(
     cell: LFRCell,
     u: Float[Tensor, "R T nu"],

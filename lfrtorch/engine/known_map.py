@@ -121,6 +121,11 @@ class KnownMap(Module):
         return dict(zip(self.equations.parameters, values, strict=True))
 
     @property
+    def outputs_have_parameters(self) -> bool:
+        """Whether y depends on parameters of its own, and not through the states alone."""
+        return max(self.equations.h.used, default=0) >= self.nz
+
+    @property
     def steps(self) -> tuple[float, int, int]:
         """Seconds of one step of the integration, their number, and those before the output."""
         e = self.equations

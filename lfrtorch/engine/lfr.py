@@ -64,8 +64,8 @@ class LFR(nn.Module):
         check_start(start, "simulation")
         self.cell.check()
         self.cell.check_signals(u, x0, guess)
-        if start == "estimated":
-            raise InputError("start='estimated' is fitted to a record's output: Model.simulate.")
+        if start in ("estimated", "measured"):
+            raise InputError(f"start='{start}' needs a record's output: Model.simulate.")
         if start == "periodic":
             return steady_state(self.cell, u, x0 if guess is None else guess)
         zero = u.new_zeros(len(u), self.cell.nx)

@@ -225,6 +225,12 @@ class Formula(NamedTuple):
             place[number] = rows.setdefault(row, len(rows))
         return Formula(self.inputs, tuple(rows), tuple(place[i] for i in self.results))
 
+    @property
+    def used(self) -> set[int]:
+        """The inputs that a result depends on, of a table without rows that none needs."""
+        rows = {i for row in self.rows for i in row.operands} | {*self.results}
+        return {i for i in rows if i < self.inputs}
+
     def evaluated(
         self, inputs: Sequence[Any], operations: dict[str, Callable[..., Any]], constant: Any
     ) -> list[Any]:

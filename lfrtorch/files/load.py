@@ -40,7 +40,7 @@ __all__ = ["load_records"]
 Paths = str | Path | Sequence[str | Path]
 Use = float | str | Path | Sequence[str | Path] | None
 
-Start = Literal["auto", "zero", "estimated", "periodic"]
+Start = Literal["auto", "zero", "estimated", "periodic", "measured"]
 Period = int | Literal["auto"] | None
 
 EVERYTHING = "all"
@@ -106,8 +106,9 @@ def load_records(
             files, as for ``path``. 0 for none.
         test: records that are scored, likewise: of a fraction the last part, of a number the last
             records. ``"all"``: every record, for a model that is there; nothing is left to fit.
-        start: ``"zero"`` (at rest), ``"estimated"`` (amid the measurement), or ``"periodic"``:
-            every record is cut to whole periods in steady state. Default: a record of whole periods
+        start: ``"zero"`` (at rest), ``"estimated"`` (amid the measurement), ``"measured"`` (the
+            outputs are the states), or ``"periodic"``: every record is cut to whole periods in
+            steady state. Default: a record of whole periods
             that has settled from its first sample on is periodic. Other records are from rest,
             unless linear models of most of the first three that train validate clearly better with
             an estimated start; a note has both errors. With ``test="all"`` all are from rest.
@@ -328,7 +329,9 @@ class _Reader:
         seen = y[: T - round(T * self.unseen)]  # outputs of the test choose nothing
         automatic = self.period == "auto"
         N = find_period(u if r is None else r) if automatic else cast("int | None", self.period)
-        start: Start = "estimated" if stretch.first and self.start != "periodic" else self.start
+        start: Start = self.start
+        if stretch.first and start not in ("periodic", "measured"):
+            start = "estimated"
         settling, settled = 0, False
         if N is not None and self.skip is None and start != "estimated":
             settling = find_transient(seen, N)
@@ -358,6 +361,7 @@ class _Reader:
             kept, skip = slice(0, T), self.skip or 0
             if self.skip is None and start == "zero":
                 skip = warm_up(T, settling)
+            skip = max(1, skip) if start == "measured" else skip
             settling = settling if skip == settling else 0
             undecided = undecided and not settling
             if T - skip < SHORTEST:

@@ -17,7 +17,8 @@ def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
     """Cut a record into parts by use; one whose fraction is 0 is left out."""
     # Every part begins where the record begins and is simulated from there: only its own samples
     # are scored, so the transient of the start reaches neither validation nor test. A record in
-    # steady state is cut into whole periods, which are in steady state themselves.
+    # steady state is cut into whole periods, which are in steady state themselves, and a part with
+    # a measured start begins at its own first output.
     names = ["train", *["validation"] * bool(validation), *["test"] * bool(test)]
     steady = record.start == "periodic"
     unit = (record.period or record.samples) if steady else 1
@@ -44,5 +45,7 @@ def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
                     "fractions or skip."
                 )
             part = replace(record[:end], start=record.start, skip=first)
+            if record.start == "measured":  # from its own first output
+                part = replace(record[begin:end], skip=max(1, first - begin))
         parts[name], begin = part, end
     return parts

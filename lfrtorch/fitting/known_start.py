@@ -9,7 +9,7 @@ begins at zero, so the model begins as the known one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import deepcopy
+from copy import copy, deepcopy
 from dataclasses import replace
 from typing import Any, cast
 
@@ -25,6 +25,7 @@ from lfrtorch.engine.known_map import KnownMap
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial, known_parts
 from lfrtorch.fitting.driven_states import relaxation_frequencies
+from lfrtorch.fitting.from_outputs import begins_at_outputs, begun_on_short_windows, in_windows
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Stage
@@ -37,6 +38,9 @@ from lfrtorch.records import Record, Scaler, common_unit, rms_scale
 
 _ITERATIONS = 240
 """Of the first fit, to the parameters alone; there are few of them."""
+
+_FROM_OUTPUTS = 20
+"""The same after those over short windows, which begin at outputs."""
 
 _STARTS, _SPREAD = 8, 0.5
 """Values of the parameters that it starts from, and the deviation of the logarithms of others."""
@@ -192,7 +196,13 @@ def known_starts(stage: Stage, linear: LinearModel) -> tuple[Settings, list[Mode
     """
     dataset, settings, observer = stage.dataset, stage.settings, stage.observer
     known = cast(Known, settings.known)
-    model = known_model(known, linear, dataset.train)
+    from_outputs = begins_at_outputs(dataset.train)
+    if from_outputs:  # which are states: nothing learned acts on them at once
+        known = copy(known)
+        known.acts_on = tuple(name for name in known.acts_on if name != "y")
+        settings = replace(settings, known=known)
+    records = in_windows(stage)
+    model = known_model(known, linear, records)
     grey = settings.nn == 0 and not settings.nx and settings.static == "network"
     count = _STARTS if settings.starts == "auto" else settings.starts
     if known.parameters:
@@ -200,6 +210,11 @@ def known_starts(stage: Stage, linear: LinearModel) -> tuple[Settings, list[Mode
         options["trainer"] = LevenbergMarquardt(max_iter=_ITERATIONS)
         monitor = observer.searching()
         begun = count if grey else _STARTS
+        if from_outputs:  # short windows lead to the best minimum
+            begun, options["trainer"] = 1, LevenbergMarquardt(max_iter=_FROM_OUTPUTS)
+            _, (model,) = begun_on_short_windows(
+                replace(stage, settings=replace(settings, starts=1)), [model], ridge=0.0
+            )
         try:
             result = fit(
                 [model, *(varied(model, settings.seed + n) for n in range(1, begun))],
@@ -228,7 +243,7 @@ def known_starts(stage: Stage, linear: LinearModel) -> tuple[Settings, list[Mode
     if grey:
         return replace(settings, starts=1, ridge=0.0), [model]
     settings = replace(settings, starts=count)
-    return settings, [with_learned(model, dataset.train, settings, n) for n in settings.seeds]
+    return settings, [with_learned(model, records, settings, n) for n in settings.seeds]
 
 
 def physical(model: Model) -> dict[str, float]:

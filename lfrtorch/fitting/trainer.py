@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, Self
 
@@ -259,9 +260,10 @@ class Fit:
         longest = max(record.samples for record in as_records(train))
         if horizon is not None:
             nx = model.lfr.cell.nx
-            train = windows(as_records(train), horizon, nx)
+            cut = partial(windows, horizon=horizon, nx=nx, y_scale=model.scaler.y_scale)
+            train = cut(as_records(train))
             if validation:
-                validation = windows(as_records(validation), horizon, nx, fitted=False)
+                validation = cut(as_records(validation), fitted=False)
         if simulation:
             self.problem = Problem.of_predictor(model, train, simulation, ridge=ridge, ranks=ranks)
         else:

@@ -15,6 +15,11 @@ integrators; and it still depends on θ through all samples before the window. A
 eliminated (``lfrtorch.least_squares.start_states``), theirs are no parameters of a step's system.
 No constraint joins a window to the next one.
 
+Where outputs tell the states (``start="measured"``) a window begins at an output, with nothing to
+estimate: the error over it is that of predictions 1 to h samples ahead. It is weighed by that of
+holding the output, in each record: errors that grow fast, as those of rates do, would hide the
+others. Outputs of one unit have one weight.
+
 Windows of the validation records choose the iterate, each simulated from a state that is fitted to
 samples before it, so that no error is of a sample that its state was fitted to. A whole simulation
 is a poor judge of a model on its way: where small changes grow, it is wrong after some time even if
@@ -37,6 +42,7 @@ import numpy as np
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.records import Record
 
 BEFORE = 20
@@ -46,7 +52,12 @@ and 100 of 61 of 84: where small changes grow, the error over more samples has m
 
 
 def windows(
-    records: Sequence[Record], horizon: int, nx: int, *, fitted: bool = True
+    records: Sequence[Record],
+    horizon: int,
+    nx: int,
+    *,
+    fitted: bool = True,
+    y_scale: Array | None = None,
 ) -> list[Record]:
     """The samples that a fit scores, in windows of ``horizon`` samples."""
     # Windows of a record are spread evenly and overlap as little as they can; their samples have
@@ -57,6 +68,9 @@ def windows(
     integer("horizon", horizon, 2)
     found = []
     for record in records:
+        if record.start == "measured":
+            found += _from_outputs(record, horizon, y_scale)
+            continue
         if record.samples - record.skip <= horizon:
             found.append(record)
             continue
@@ -73,6 +87,26 @@ def windows(
         before = max(math.ceil(BEFORE * nx / record.y.shape[1]), record.skip)
         found += _windows(record, horizon, 0 if fitted else before)
     return found
+
+
+def _from_outputs(record: Record, horizon: int, y_scale: Array | None) -> list[Record]:
+    """Windows that begin at measured outputs, with the weight of the record's samples together."""
+    last = max(record.samples - 1 - horizon, 0)
+    begins = np.linspace(0, last, 1 + math.ceil(last / horizon)).round().astype(int)
+    weight = np.asarray(record.weight) * (record.samples - 1) / (len(begins) * horizon)
+    if y_scale is not None:
+        weight = weight * (y_scale / _held(record, horizon)) ** 2
+    whole = replace(record, period=None, weight=weight, skip=0)
+    return [replace(whole, **record.signals_in(slice(b, b + horizon + 1)), skip=1) for b in begins]
+
+
+def _held(record: Record, horizon: int) -> Array:
+    """Rms error of holding each output over a horizon, together with those of its unit."""
+    ahead = range(1, min(horizon, record.samples - 1) + 1)
+    squares = np.mean([((record.y[h:] - record.y[:-h]) ** 2).mean(axis=0) for h in ahead], axis=0)
+    units = np.array([channel.unit or channel.name for channel in record.outputs])
+    together = np.array([squares[units == unit].mean() for unit in units])
+    return np.sqrt(np.where(together > 0, together, 1.0))
 
 
 def _windows(record: Record, horizon: int, before: int) -> list[Record]:

@@ -14,6 +14,7 @@ from torch import Tensor
 from lfrtorch._support.errors import InputError
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.nonlinearity import known_parts
 from lfrtorch.least_squares.exact_integrators import fixed_parameters
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
@@ -261,6 +262,8 @@ def _errors_of(
             f"{ranks.world} processes share {len(data)} record(s); each needs one: start "
             "fewer processes, or cut the data into more records."
         )
+    if any(record.start == "measured" for record in data):
+        _check_measured(model)
     estimated = any(record.start == "estimated" for record in data)
     free = any(p.requires_grad for p in model.lfr.parameters())
     if not free and not estimated and not solve_initial_states:
@@ -272,3 +275,22 @@ def _errors_of(
         y_scale=model.scaler.y_scale,
         solve_initial_states=solve_initial_states,
     )
+
+
+def _check_measured(model: Model) -> None:
+    """Refuse a fit from measured starts of a model whose output has an equation to be fitted."""
+    cell = model.lfr.cell
+    free = [
+        name
+        for name in ("Cy", "Dyu", "Dyw")
+        if cell.get_parameter(name).numel()
+        and not (name in cell.fixed and bool(cell.fixed[name].all()))
+    ]
+    parts = known_parts(cell.static)
+    if free or (parts is not None and parts[0].outputs_have_parameters):
+        raise InputError(
+            "start='measured' takes the states from the output, whose equation is to be fitted "
+            "here. Give a known model whose outputs are states, without parameters, and learned "
+            "parts that do not act on y (acts_on=[...]), or the matrices "
+            "fixed={'Cy': ..., 'Dyu': ..., 'Dyw': ...}; or start='estimated'."
+        )

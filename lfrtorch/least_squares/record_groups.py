@@ -17,6 +17,8 @@ from torch.nn.functional import pad
 
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.initial_state import measured_start
 from lfrtorch.records import NormalisedRecord, Record, Start
 
 EVERY = slice(None)
@@ -85,9 +87,9 @@ class RecordGroup:
 
 
 def group_records(
-    records: Sequence[NormalisedRecord], like: Tensor, ranks: Ranks
+    records: Sequence[NormalisedRecord], cell: LFRCell, ranks: Ranks
 ) -> list[RecordGroup]:
-    """A process's share of the records, grouped, as tensors ``like`` another one."""
+    """A process's share of the records, grouped, as tensors like the weights of the cell."""
     members: dict[tuple[int, Start, bool], list[NormalisedRecord]] = defaultdict(list)
     estimated: dict[tuple[int, Start, bool], list[int]] = defaultdict(list)
     count = itertools.count()
@@ -99,7 +101,15 @@ def group_records(
     groups = []
 
     def stacked(arrays: list[NDArray]) -> Tensor:
-        return torch.tensor(np.stack(arrays)).to(like)
+        return torch.tensor(np.stack(arrays)).to(cell.A)
+
+    def start_states(start: Start, group: Sequence[NormalisedRecord]) -> Tensor | None:
+        if start == "given":
+            return stacked([each.record.x0 for each in group if each.record.x0 is not None])
+        if start == "measured":  # the same at every θ: the output's equation is not fitted
+            first = [(each.u[0], each.y[0]) for each in group]
+            return measured_start(cell, *(stacked(list(s)) for s in zip(*first, strict=True)))
+        return None
 
     for kind, group in members.items():
         _, start, spectral = kind
@@ -108,9 +118,7 @@ def group_records(
             RecordGroup(
                 u=stacked([each.u for each in group]),
                 y=stacked([each.y for each in group]),
-                x0=stacked([r.x0 for r in physical if r.x0 is not None])
-                if start == "given"
-                else None,
+                x0=start_states(start, group),
                 estimated=torch.tensor(estimated[kind]) if start == "estimated" else None,
                 scored=stacked([r.scored for r in physical]),
                 weight=stacked([_factors(r) for r in physical]),

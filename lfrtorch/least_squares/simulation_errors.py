@@ -75,7 +75,7 @@ class SimulationErrors:
         cell.check()
         self._cell, self.ranks, self._y_scale = deepcopy(cell), ranks, y_scale
         self._solved = solve_initial_states
-        self.groups = group_records(records, cell.A, ranks)
+        self.groups = group_records(records, self._cell, ranks)
         self.size = sum(int(each.record.scored.sum()) for each in records)
         estimated = sum(each.record.start == "estimated" for each in records)
         self.parameters = Parameters(cell, 0 if solve_initial_states else estimated)

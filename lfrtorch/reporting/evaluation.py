@@ -21,6 +21,7 @@ from lfrtorch.records import Channel, Record, without_coordinates
 from lfrtorch.score_window import fitted
 
 _LINEAR, _NL_LFR = "linear", "NL-LFR"  # names of the two models
+_HOLD = "hold"  # the name of no model: what was measured stays
 
 CROSS = "cross-validation"
 """Name of what stands for a validation record if all records are fitted."""
@@ -48,6 +49,8 @@ class Score:
     std_by_output: tuple[float, ...]
     start_error: float | None  # what an estimated start's uncertainty adds to rmse
     records: int = 1
+    sums: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Errors summed over the samples of a horizon, by measure and by model."""
 
     def entry(self) -> dict[str, Any]:
         """For ``metrics.json``: errors of each output and the number of records if several."""
@@ -62,6 +65,9 @@ class Score:
             found["lti_rmse_by_output"] = list(self.lti_rmse_by_output)
         if self.records > 1:
             found["records"] = self.records
+        names = {_NL_LFR: "", _LINEAR: "lti_", _HOLD: "hold_"}
+        for measure, by_model in self.sums.items():
+            found |= {names[name] + measure: error for name, error in by_model.items()}
         return found | {"start_error": self.start_error}
 
 
@@ -73,6 +79,7 @@ class Response:
     use: str
     simulated: Mapping[str, Array]  # outputs (T, ny) by "linear" and "NL-LFR", one or both
     start_error: float | None = None
+    sums: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by measure and model
 
     @property
     def y_linear(self) -> Array:
@@ -128,6 +135,7 @@ class Response:
             lti_rmse_by_output=by_output.get(_LINEAR, ()),
             std_by_output=tuple(std),
             start_error=self.start_error,
+            sums=self.sums,
         )
 
 
@@ -140,6 +148,7 @@ class Evaluation:
     model: Model | None = None
     refitted: Model | None = None  # to all estimation records: it simulates the tests
     own: Mapping[str, LinearModel] = field(default_factory=dict)  # of single tests, by name
+    horizon: int | None = None  # of the fit: how far ahead records with measured starts are scored
     left_out: Sequence[Response] = ()  # by models that were fitted and chosen without each sample
 
     @cached_property
@@ -150,12 +159,36 @@ class Evaluation:
         for use, record in self._records:
             linear, model = self._models(use, record)
             driven, added = fitted(record) if use == "train" else record, None
+            if record.start == "measured" and self.horizon is not None:
+                found.append(self._ahead(record, use, self.horizon))
+                continue
             simulated = {} if linear is None else {_LINEAR: linear.simulate(driven)}
             if model is not None:
                 simulated[_NL_LFR] = y_hat = model.simulate(driven)
                 added = None if use == "train" else start_error(model, record, y_hat)
             found.append(Response(record, use, simulated, added))
         return [*found, *self.left_out]
+
+    def _ahead(self, record: Record, use: str, horizon: int) -> Response:
+        """A record from each of its outputs on: what is shown is the last sample of the horizon."""
+        linear, model = self._models(use, record)
+        models = {_LINEAR: None if linear is None else linear.to_model(), _NL_LFR: model}
+        models = {name: each for name, each in models.items() if each is not None}
+        measured = np.lib.stride_tricks.sliding_window_view(record.y, horizon, axis=0)[1:]
+        measured = measured.transpose(0, 2, 1)
+        of = {name: each.ahead(record, horizon) for name, each in models.items()}
+        sums = {
+            measure: {
+                name: float(error(y_hat, measured).mean(axis=0).sum())
+                for name, y_hat in {_HOLD: record.y[:-horizon, None], **of}.items()
+            }
+            for measure, error in (self.dataset.ahead if use != "train" else {}).items()
+        }
+        shown = {
+            name: record.shown(np.concatenate([record.y[:1], y_hat[0, :-1], y_hat[:, -1]]))
+            for name, y_hat in of.items()
+        }
+        return Response(replace(record, skip=max(record.skip, horizon)), use, shown, sums=sums)
 
     @cached_property
     def predictions(self) -> dict[int, list[Response]]:
@@ -254,6 +287,10 @@ def _together(scores: Sequence[Score]) -> Score:
         nrmse=mean([s.nrmse for s in scores]),
         start_error=mean([s.start_error for s in scores]),
         records=len(scores),
+        sums={
+            measure: {name: float(np.mean([s.sums[measure][name] for s in scores])) for name in of}
+            for measure, of in scores[0].sums.items()
+        },
         **{f"{name}_by_output": values for name, values in errors.items()},
         **{name: sum(getattr(s, name) for s in scores) for name in ("samples", "skip", "scored")},
     )

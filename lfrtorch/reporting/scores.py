@@ -179,7 +179,25 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     references += [f"{p.label}: {p.reference}" for p in others if p.label in head]
     table = tables.table(head, cells)
     simulated = [f"{title}, {shown}", "", table, *[""] * bool(references), *references]
-    return "\n".join(simulated) + prediction_table(result)
+    return "\n".join(simulated) + prediction_table(result) + sums_table(result, published)
+
+
+def sums_table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
+    """Errors summed over the samples of a horizon, a line a record and measure; or nothing."""
+    rows: list[list[tables.Cell]] = []
+    for part in (result["scores"], result["validation"]["records"]):
+        for name, s in part.items():
+            for measure in (key.removeprefix("hold_") for key in s if key.startswith("hold_")):
+                errors = [s.get(f"{which}{measure}") for which in ("hold_", "lti_", "")]
+                others = [p.scores.get(f"{name} {measure}") for p in published]
+                rows.append([name, s["use"], measure, *errors, *others])
+    if not rows:
+        return ""
+    head = ["record", "use", "sum of", "hold", "linear", "NL-LFR", *(p.label for p in published)]
+    kept = [i for i in range(len(head)) if any(row[i] is not None for row in rows)]
+    rows = [[row[i] for i in kept] for row in rows]
+    listed = tables.table([head[i] for i in kept], rows)
+    return f"\n\nErrors from each sample on, summed over the horizon\n\n{listed}"
 
 
 def lines(

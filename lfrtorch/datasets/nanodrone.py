@@ -1,0 +1,170 @@
+"""NanoDrone: flights of a Crazyflie 2.1, an unstable system with four inputs and twelve outputs.
+
+Inputs are the speeds of the four motors (rad/s), outputs position (m) and velocity (m/s) in the
+frame of the room, roll, pitch and yaw (rad) and the body's rates (rad/s), at 100 Hz. A row holds
+inputs and outputs of the same instant; the inputs of a row act on the outputs of the next one. The
+first inputs of a flight are missing: the second ones take their place. Angles are unwrapped.
+
+From each output on, the outputs 1 to 50 samples ahead are predicted from the inputs. Scores are the
+sums over these 50 samples of the mean error: Euclidean for position, velocity and rates, the angle
+between the two attitudes for the third.
+
+Four flights each of three kinds, squares, chirps and random ones, are for estimation, three of a
+fourth kind, melon, for the test. The release has quaternions and accelerations in CSV files; what
+is read here are the arrays u (N, 4) and y (N, 12) of ``.npz`` files with the sampling frequency fs.
+
+References:
+    Busetto et al., "NanoDrone: a benchmark for the identification of an aerial robot", Control
+    Engineering Practice 172, 2026, 106871.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
+from lfrtorch.dataset import Dataset, Published
+from lfrtorch.datasets import official
+from lfrtorch.records import Channel, Record
+
+__all__ = ["load"]
+
+_FOLDER = "nanodrone"
+_KINDS = ("chirp", "random", "square")  # of flights for estimation
+HORIZON = 50
+"""Samples ahead that are scored."""
+
+INPUTS = tuple(Channel(f"motor{i}", "rad/s") for i in range(1, 5))
+OUTPUTS = tuple(
+    Channel(name, unit)
+    for names, unit in (
+        (("x", "y", "z"), "m"),
+        (("vx", "vy", "vz"), "m/s"),
+        (("roll", "pitch", "yaw"), "rad"),
+        (("p", "q", "r"), "rad/s"),
+    )
+    for name in names
+)
+_ANGLES = slice(6, 9)
+
+
+def _euclidean(first: int):
+    """The error of three outputs from the first on."""
+
+    def error(y_hat: Float[Array, "n h 12"], y: Float[Array, "n h 12"]) -> Float[Array, "n h"]:
+        return np.linalg.norm((y_hat - y)[..., first : first + 3], axis=-1)
+
+    return error
+
+
+def _geodesic(y_hat: Float[Array, "n h 12"], y: Float[Array, "n h 12"]) -> Float[Array, "n h"]:
+    """The angle of the rotation between two attitudes, rad."""
+
+    def attitude(signal: Array) -> Rotation:
+        return Rotation.from_euler("xyz", signal[..., _ANGLES].reshape(-1, 3))
+
+    there = np.asarray(np.isfinite(y_hat).all(axis=-1))
+    y_hat = np.broadcast_to(np.where(np.expand_dims(there, -1), y_hat, 0.0), y.shape)
+    angle = (attitude(y_hat) * attitude(y).inv()).magnitude().reshape(y.shape[:2])
+    return np.where(there, angle, np.inf)
+
+
+MEASURES = {
+    "position": _euclidean(0), "velocity": _euclidean(3), "attitude": _geodesic,
+    "rates": _euclidean(9),
+}  # fmt: skip
+"""Errors (n, h) of predictions, by what the benchmark calls them."""
+
+_PAPER = "Busetto et al., 2026"
+_PUBLISHED = [
+    Published(label, dict(zip((f"melon {name}" for name in MEASURES), row, strict=True)), _PAPER)
+    for label, *row in (
+        ("physics", 2.322, 10.62, 5.101, 29.09),
+        ("physics + MLP", 2.363, 10.40, 6.153, 28.99),
+        ("MLP", 4.052, 12.58, 6.059, 35.57),
+        ("LSTM", 5.971, 16.72, 5.653, 35.84),
+    )
+]
+
+
+def load(
+    *, validation: int = 1, left_out: str | None = None, root: str | Path | None = None
+) -> Dataset:
+    """Flights for estimation by kind, and those of the test where they are at hand.
+
+    Args:
+        validation: flights of each kind that choose the iterate, the last ones.
+        left_out: a kind of flight, ``"chirp"``, ``"random"`` or ``"square"``, that is not for
+            estimation but a test, in place of the official one.
+        root: folder that holds ``nanodrone/train_*.npz``, as ``train_chirp_run1.npz``, and
+            ``nanodrone/test_*.npz``.
+
+    Shape:
+        u: (T, 4), y: (T, 12), T about 6000, or 1900 of squares.
+
+    Example:
+        >>> data = lfrtorch.datasets.nanodrone.load(root="benchmarks")  # doctest: +SKIP
+    """
+    integer("validation", validation, 0)
+    if left_out is not None and left_out not in _KINDS:
+        raise InputError(f"left_out is {left_out!r}; give one of {', '.join(_KINDS)}, or None.")
+    folder = official.folder(root) / _FOLDER
+    flights = {kind: sorted(folder.glob(f"train_{kind}_*.npz")) for kind in _KINDS}
+    missing = [kind for kind, found in flights.items() if len(found) <= validation]
+    if missing:
+        raise FileNotFoundError(
+            f"'{folder}' holds {', '.join(f'{len(flights[k])} flights {k}' for k in missing)} "
+            f"and {validation} of each kind validate; give the folder above nanodrone/ with "
+            "train_chirp_run1.npz, ... as root=DIR."
+        )
+    tests = sorted(folder.glob("test_*.npz"))
+    notes: tuple[str, ...] = ()
+    if left_out is not None:
+        tests = flights.pop(left_out)
+        notes = (f"no official test: the flights {left_out} are left out of the estimation",)
+    elif not tests:
+        notes = ("no flight of the test is here (test_*.npz): nothing is scored",)
+    records = {kind: [_flight(path) for path in found] for kind, found in flights.items()}
+    scored = [_flight(path) for path in tests]
+    last = {kind: len(found) - validation for kind, found in records.items()}
+    kinds: dict[str, list[str]] = {}
+    for record in scored:
+        kinds.setdefault(record.name.split("_")[0], []).append(record.name)
+    return Dataset(
+        name="nanodrone",
+        train=[r for kind, found in records.items() for r in found[: last[kind]]],
+        validation=[r for kind, found in records.items() for r in found[last[kind] :]],
+        tests=scored,
+        groups={kind: tuple(names) for kind, names in kinds.items()},
+        ahead=MEASURES,
+        published=() if left_out else tuple(_PUBLISHED),
+        notes=notes,
+    )
+
+
+def _flight(path: Path) -> Record:
+    """One file as a record."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            u, y, fs = (np.asarray(file[name], dtype=np.float64) for name in ("u", "y", "fs"))
+    except Exception as error:  # a damaged file makes numpy raise any of several kinds
+        raise InputError(
+            f"'{path}' holds no readable arrays u, y and fs ({error!r}); {official.again(path)}"
+        ) from error
+    if u.ndim != 2 or y.ndim != 2 or u.shape[1:] != (4,) or y.shape != (len(u), 12) or len(u) < 2:
+        raise InputError(
+            f"'{path}' holds u of shape {u.shape} and y of shape {y.shape}; expected (N, 4) and "
+            f"(N, 12): {official.again(path)}"
+        )
+    u[0] = np.where(np.isfinite(u[0]), u[0], u[1])
+    y[:, _ANGLES] = np.unwrap(y[:, _ANGLES], axis=0)
+    name = path.stem.split("_", 1)[1]
+    return Record(
+        u, y, float(fs), "measured", name=name, source="official", inputs=INPUTS, outputs=OUTPUTS
+    )

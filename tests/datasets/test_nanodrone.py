@@ -1,0 +1,108 @@
+"""NanoDrone: files, kinds of flight, and sums over the horizon."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lfrtorch import InputError
+from lfrtorch.cli.composition import composed
+from lfrtorch.datasets import nanodrone
+from lfrtorch.known_systems import nanodrone as equations
+
+
+def write(folder: Path, name: str, samples: int = 80, seed: int = 0) -> None:
+    rng = np.random.default_rng(seed)
+    u = 1750 + 100 * rng.standard_normal((samples, 4))
+    u[0] = np.nan
+    y = 0.1 * np.cumsum(rng.standard_normal((samples, 12)), axis=0)
+    y[40:, 8] += 2 * np.pi  # a yaw that jumps
+    np.savez(folder / f"{name}.npz", u=u, y=y, fs=100.0)
+
+
+@pytest.fixture
+def flights(tmp_path: Path) -> Path:
+    folder = tmp_path / "nanodrone"
+    folder.mkdir()
+    for kind in ("chirp", "random", "square"):
+        for run in (1, 2):
+            write(folder, f"train_{kind}_run{run}", seed=run)
+    return tmp_path
+
+
+def test_flights_by_kind(flights: Path) -> None:
+    data = nanodrone.load(root=flights)
+    assert [r.name for r in data.train] == ["chirp_run1", "random_run1", "square_run1"]
+    assert [r.name for r in data.validation] == ["chirp_run2", "random_run2", "square_run2"]
+    assert data.tests == []
+    assert "no flight of the test" in data.notes[0]
+    record = data.train[0]
+    assert record.start == "measured"
+    assert (record.u.shape, record.y.shape, record.fs) == ((80, 4), (80, 12), 100.0)
+    np.testing.assert_array_equal(record.u[0], record.u[1])
+    assert np.abs(np.diff(record.y[:, 8])).max() < np.pi
+    for run in (1, 2, 3):
+        write(flights / "nanodrone", f"test_melon_run{run}", seed=run)
+    tested = nanodrone.load(root=flights)
+    assert tested.groups == {"melon": ("melon_run1", "melon_run2", "melon_run3")}
+    assert tested.published[0].scores["melon position"] == 2.322
+
+
+def test_a_kind_that_is_left_out_is_the_test(flights: Path) -> None:
+    data = nanodrone.load(root=flights, left_out="random")
+    assert {r.name.split("_")[0] for r in (*data.train, *data.validation)} == {"chirp", "square"}
+    assert data.groups == {"random": ("random_run1", "random_run2")}
+    assert data.published == ()
+
+
+def test_what_is_wrong_with_files_is_said(flights: Path) -> None:
+    with pytest.raises(InputError, match="left_out is 'melon'; give one of chirp"):
+        nanodrone.load(root=flights, left_out="melon")
+    with pytest.raises(FileNotFoundError, match="holds 2 flights chirp"):
+        nanodrone.load(root=flights, validation=2)
+    with pytest.raises(FileNotFoundError, match="holds 0 flights chirp"):
+        nanodrone.load(root=flights / "elsewhere")
+    path = flights / "nanodrone" / "train_chirp_run1.npz"
+    np.savez(path, u=np.zeros((5, 3)), y=np.zeros((5, 12)), fs=100.0)
+    with pytest.raises(InputError, match=r"u of shape \(5, 3\)"):
+        nanodrone.load(root=flights)
+    path.write_bytes(b"no archive")
+    with pytest.raises(InputError, match="no readable arrays"):
+        nanodrone.load(root=flights)
+
+
+def test_errors_are_lengths_and_angles() -> None:
+    y = np.zeros((1, 2, 12))
+    y_hat = y.copy()
+    y_hat[0, 0, :3] = [1.0, 2.0, 2.0]
+    y_hat[0, 1, 6:9] = [0.0, 0.3, 0.0]
+    assert nanodrone.MEASURES["position"](y_hat, y).tolist() == [[3.0, 0.0]]
+    np.testing.assert_allclose(nanodrone.MEASURES["attitude"](y_hat, y), [[0.0, 0.3]])
+    # Whole turns are no errors, and a model that diverges is not scored as well.
+    y_hat[0, 1, 8] = 2 * np.pi
+    np.testing.assert_allclose(nanodrone.MEASURES["attitude"](y_hat, y), [[0.0, 0.3]])
+    y_hat[0, 0, 0] = np.inf
+    assert nanodrone.MEASURES["attitude"](y_hat, y)[0, 0] == np.inf
+
+
+def test_the_body_turns_as_rotations_do() -> None:
+    """One sample of the equations beside the matrix exponential of the rates."""
+    static = equations().map(4, 12, 100.0)
+    z = np.zeros(16)
+    z[6:9], z[9:12], z[12:] = [0.3, -0.2, 0.5], [1.0, -2.0, 0.7], 1750.0
+    w = static(static.p.new_tensor(z)).detach().numpy()
+    rates = 0.5 * (z[9:12] + w[9:12])  # in the middle of the sample
+    turned = Rotation.from_euler("xyz", z[6:9]) * Rotation.from_rotvec(0.01 * rates)
+    assert (turned.inv() * Rotation.from_euler("xyz", w[6:9])).magnitude() < 2e-4
+    thrust = static.physical["thrust"] * 4 * 1.75**2
+    pull = Rotation.from_euler("xyz", z[6:9]).apply([0.0, 0.0, thrust]) - [0.0, 0.0, 9.81]
+    np.testing.assert_allclose(w[3:6], 0.01 * pull, atol=1e-12)
+
+
+def test_the_benchmark_has_its_equations_and_horizon() -> None:
+    cfg = composed("config", ["+bench=nanodrone"])
+    assert cfg.horizon == nanodrone.HORIZON
+    assert cfg.known._target_ == "lfrtorch.known_systems.nanodrone"

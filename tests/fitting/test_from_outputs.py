@@ -1,0 +1,200 @@
+"""Measured starts: states that are outputs, unstable systems, errors over a horizon."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import lfrtorch
+from lfrtorch import (
+    Channel,
+    Dataset,
+    InputError,
+    Known,
+    LFRCell,
+    Parameter,
+    Record,
+    Settings,
+    load_records,
+)
+from lfrtorch.engine.initial_state import measured_start
+from lfrtorch.fitting.windows import windows
+from lfrtorch.linear.measured_states import measured_states_model
+
+FS, GRAVITY, GAIN, DAMPING = 50.0, 20.0, 10.0, 0.5
+HORIZON = 25
+OUTPUTS = Channel("angle", "rad"), Channel("speed", "rad/s")
+
+
+def inverted(x: Any, u: Any, p: Any) -> Any:
+    return x.speed, p.gravity * torch.sin(x.angle) + p.gain * u[0] - p.damping * x.speed
+
+
+def known(**options: Any) -> Known:
+    begun = {"gravity": Parameter(10.0), "gain": Parameter(5.0), "damping": Parameter(1.0)}
+    return Known(inverted, states=["angle", "speed"], parameters=begun, **options)
+
+
+def flight(seed: int, samples: int = 1500) -> Record:
+    """A pendulum that a controller holds upright, both states measured with a little noise."""
+    rng = np.random.default_rng(seed)
+    x, steps, u, y = np.array([0.1, 0.0]), 10, [], []
+    wanted = np.repeat(0.6 * rng.standard_normal(samples // 25 + 1), 25)
+    for k in range(samples):
+        y.append(x)
+        u.append(-4.0 * (x[0] - wanted[k]) - 1.0 * x[1])
+        for _ in range(steps):
+            rate = GRAVITY * np.sin(x[0]) + GAIN * u[-1] - DAMPING * x[1]
+            x = x + np.array([x[1], rate]) / (steps * FS)
+    noise = [1e-3, 5e-3] * rng.standard_normal((samples, 2))
+    name = f"flight{seed}"
+    return Record(np.array(u), np.array(y) + noise, FS, "measured", name=name, outputs=OUTPUTS)
+
+
+@pytest.fixture(scope="module")
+def flights() -> Dataset:
+    one, two, three = (flight(seed) for seed in range(3))
+
+    def rates(y_hat: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.abs((y_hat - y)[..., 1])
+
+    return Dataset("upright", [one], [two], [three], ahead={"rates": rates})
+
+
+@pytest.fixture(scope="module")
+def with_equations(flights: Dataset) -> lfrtorch.Run:
+    return lfrtorch.identify(flights, Settings(known=known(), nx=0, nn=0, horizon=HORIZON))
+
+
+def test_an_unstable_known_system_is_found(with_equations: lfrtorch.Run, flights: Dataset) -> None:
+    found = with_equations.metrics["known"]["values"]
+    values = {name: entry["value"] for name, entry in found.items()}
+    assert values["gravity"] == pytest.approx(GRAVITY, rel=0.03)
+    assert values["gain"] == pytest.approx(GAIN, rel=0.03)
+    (score,) = with_equations.metrics["scores"].values()
+    assert score["rates"] < 0.1 * score["hold_rates"]
+    assert score["rates"] < score["lti_rates"]
+    assert score["skip"] == HORIZON
+
+
+def test_sums_are_those_of_simulations_from_each_sample(
+    with_equations: lfrtorch.Run, flights: Dataset
+) -> None:
+    model, (test,) = with_equations.model, flights.tests
+    total = []
+    for first in range(0, test.samples - HORIZON):
+        y_hat = model.simulate(test[first : first + HORIZON + 1])
+        total.append(np.abs(y_hat - test.y[first : first + HORIZON + 1])[1:, 1])
+    expected = np.mean(total, axis=0).sum()
+    assert with_equations.metrics["scores"][test.name]["rates"] == pytest.approx(expected)
+
+
+def test_predictions_without_noise_model_begin_at_outputs(
+    with_equations: lfrtorch.Run, flights: Dataset
+) -> None:
+    model, (test,) = with_equations.model, flights.tests
+    y_hat = model.predict(test, horizon=5)
+    for sample in (5, 40, test.samples - 1):
+        own = model.simulate(test[sample - 5 : sample + 1])
+        np.testing.assert_allclose(y_hat[sample], own[-1], rtol=1e-9)
+    np.testing.assert_allclose(y_hat[:5], model.simulate(test[:5]), rtol=1e-6, atol=1e-9)
+    with pytest.raises(InputError, match="has 20 samples and horizon is 20"):
+        model.ahead(test[:20], 20)
+
+
+def test_a_checkpoint_predicts_the_same(with_equations: lfrtorch.Run, flights: Dataset, tmp_path):
+    with_equations.model.save(tmp_path / "model")
+    loaded = lfrtorch.load(tmp_path / "model")
+    (test,) = flights.tests
+    expected = with_equations.model.ahead(test, 7)
+    np.testing.assert_allclose(loaded.ahead(test, 7), expected, rtol=1e-9)
+
+
+def test_a_black_box_has_the_outputs_as_states(flights: Dataset) -> None:
+    settings = Settings(nx="auto", nz=1, nw=1, nn=6, horizon=HORIZON, starts=1)
+    run = lfrtorch.identify(flights, settings)
+    cell = run.model.lfr.cell
+    assert torch.equal(cell.Cy, torch.eye(2, dtype=torch.float64))
+    assert not cell.Dyu.any()
+    assert not cell.Dyw.any()
+    (score,) = run.metrics["scores"].values()
+    assert score["rates"] < 0.7 * score["lti_rates"]
+
+
+def test_hidden_states_begin_at_rest() -> None:
+    cell = LFRCell(nu=1, ny=2, nx=3, dtype=torch.float64)
+    with torch.no_grad():
+        cell.Cy[:, :2], cell.Dyu[0] = 2.0 * torch.eye(2), 1.0
+    u, y = torch.tensor([[3.0], [0.0]]).double(), torch.tensor([[5.0, 4.0], [1.0, 0.0]]).double()
+    expected = torch.tensor([[1.0, 2.0, 0.0], [0.5, 0.0, 0.0]]).double()
+    assert torch.allclose(measured_start(cell, u, y), expected)
+
+
+def test_the_linear_model_is_that_of_the_next_sample() -> None:
+    rng = np.random.default_rng(0)
+    A, B = np.array([[1.0, 0.02], [0.3, 1.1]]), np.array([[0.0], [0.5]])
+    u, y = rng.standard_normal((60, 1)), np.zeros((60, 2))
+    for k in range(59):
+        y[k + 1] = A @ y[k] + B @ u[k] + [0.1, 0.0]
+    found = measured_states_model([Record(u, y, start="measured")])
+    np.testing.assert_allclose(found.A, A, atol=1e-3)
+    np.testing.assert_allclose(found.B, B, atol=1e-3)
+
+
+def test_windows_weigh_outputs_of_one_unit_alike() -> None:
+    y = np.cumsum(np.random.default_rng(0).standard_normal((101, 3)) * [1.0, 3.0, 50.0], axis=0)
+    outputs = Channel("x", "m"), Channel("y", "m"), Channel("speed", "m/s")
+    record = Record(np.zeros(101), y, 1.0, "measured", outputs=outputs)
+    cut = windows([record], 10, 3, y_scale=np.ones(3))
+    assert len(cut) == 10
+    assert {(part.samples, part.skip, part.start) for part in cut} == {(11, 1, "measured")}
+    held = [np.mean([(y[h:] - y[:-h]) ** 2 for h in [n]]) for n in range(1, 11)]
+    weight = np.asarray(cut[0].weight)
+    assert weight[0] == weight[1]
+    assert weight[0] > 100 * weight[2]
+    squares = np.mean([((y[h:] - y[:-h]) ** 2).mean(axis=0) for h in range(1, 11)], axis=0)
+    assert weight[0] == pytest.approx(1 / squares[:2].mean())
+    assert len(held) == 10
+
+
+def test_parts_of_a_file_begin_at_their_own_outputs(tmp_path) -> None:
+    one = flight(0, 100)
+    np.savetxt(tmp_path / "x.csv", np.hstack([one.u, one.y]), delimiter=",", header="u,y1,y2")
+    data = load_records(tmp_path / "x.csv", fs=FS, start="measured", validation=0.2, test=0.2)
+    assert [r.samples for r in (*data.train, *data.validation, *data.tests)] == [60, 20, 20]
+    assert {r.start for r in (*data.train, *data.validation, *data.tests)} == {"measured"}
+    np.testing.assert_allclose(data.tests[0].y[0], one.y[80])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"nx": 3, "nn": 2}, "the 2 outputs are the states; give nx=2"),
+        ({"nx": 2, "nn": "auto"}, "nn: auto, and sizes are not searched"),
+    ],
+)
+def test_what_cannot_be_is_refused(flights: Dataset, settings: dict[str, Any], message: str):
+    with pytest.raises(InputError, match=message):
+        lfrtorch.identify(flights, Settings(**settings, horizon=HORIZON))
+
+
+def test_outputs_that_are_fitted_tell_no_states(flights: Dataset) -> None:
+    linear = measured_states_model(flights.train)
+    cut = windows(flights.train, HORIZON, 2)
+    model = lfrtorch.initialise(linear, cut, nz=1, nw=1, nn=2)
+    with pytest.raises(InputError, match="start='measured' takes the states from the output"):
+        lfrtorch.fit(model, flights.train)
+    scaled = known(outputs=lambda x, u, p: (p.gain * x.angle, x.speed))
+    with pytest.raises(InputError, match="start='measured' takes the states from the output"):
+        lfrtorch.identify(flights, Settings(known=scaled, horizon=HORIZON))
+
+
+def test_other_starts_beside_measured_ones_are_refused(flights: Dataset) -> None:
+    (one,) = flights.train
+    mixed = Dataset("mixed", [one, replace(one, start="zero", name="rest")], [], [])
+    with pytest.raises(InputError, match="some records have start 'measured' and others not"):
+        lfrtorch.identify(mixed, Settings(known=known(), horizon=HORIZON))
