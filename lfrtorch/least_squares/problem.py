@@ -289,8 +289,7 @@ def _check_measured(model: Model) -> None:
     parts = known_parts(cell.static)
     if free or (parts is not None and parts[0].outputs_have_parameters):
         raise InputError(
-            "start='measured' takes the states from the output, whose equation is to be fitted "
-            "here. Give a known model whose outputs are states, without parameters, and learned "
-            "parts that do not act on y (acts_on=[...]), or the matrices "
+            "start='measured' takes the states from the output, whose equation is to be fitted.\n"
+            "Give a known model whose outputs are states, without parameters, or the matrices "
             "fixed={'Cy': ..., 'Dyu': ..., 'Dyw': ...}; or start='estimated'."
         )
