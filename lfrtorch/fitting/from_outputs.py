@@ -24,7 +24,7 @@ from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Stage
 from lfrtorch.fitting.trainer import StoppedError
-from lfrtorch.fitting.windows import windows
+from lfrtorch.fitting.windows import from_outputs, windows
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model import Model
 from lfrtorch.records import Record
@@ -85,19 +85,17 @@ def begun_on_short_windows(
     found, best = list(models), 0
     if settings.horizon is None:
         return settings, found
+    scale = models[0].scaler.y_scale
     for horizon in sorted({max(2, round(part * settings.horizon)) for part in _PARTS}):
         monitor = observer.searching()
+        # As many windows as there will be whole ones: these iterations cost so much less.
+        cut = [from_outputs(r, horizon, settings.horizon, scale) for r in dataset.train]
+        short = LevenbergMarquardt(max_iter=_ITERATIONS)
         result = fit(
             found,
-            dataset.train,
-            dataset.validation,
+            [part for parts in cut for part in parts],
             monitors=None if monitor is None else [[monitor]] * len(found),
-            **{
-                **stage.options,
-                "trainer": LevenbergMarquardt(max_iter=_ITERATIONS),
-                "horizon": horizon,
-                **options,
-            },
+            **{**stage.options, "trainer": short, "horizon": None, **options},
         )
         if result.reason in CUT_SHORT:
             raise StoppedError(f"stopped during the fit over windows of {horizon} samples")

@@ -69,7 +69,7 @@ def windows(
     found = []
     for record in records:
         if record.start == "measured":
-            found += _from_outputs(record, horizon, y_scale)
+            found += from_outputs(record, horizon, horizon, y_scale)
             continue
         if record.samples - record.skip <= horizon:
             found.append(record)
@@ -89,10 +89,10 @@ def windows(
     return found
 
 
-def _from_outputs(record: Record, horizon: int, y_scale: Array | None) -> list[Record]:
+def from_outputs(record: Record, horizon: int, apart: int, y_scale: Array | None) -> list[Record]:
     """Windows that begin at measured outputs, with the weight of the record's samples together."""
     last = max(record.samples - 1 - horizon, 0)
-    begins = np.linspace(0, last, 1 + math.ceil(last / horizon)).round().astype(int)
+    begins = np.linspace(0, last, 1 + math.ceil(last / apart)).round().astype(int)
     weight = np.asarray(record.weight) * (record.samples - 1) / (len(begins) * horizon)
     if y_scale is not None:
         weight = weight * (y_scale / _held(record, horizon)) ** 2
