@@ -113,7 +113,7 @@ WEIGHTS = "must be finite, at least 0 and not all 0"
         ("the sampling frequency is 1e-320 Hz; give one between", {"fs": 1e-320}),
         ("the sampling frequency is True; give a positive number", {"fs": True}),
         *[("between 1e-100 and 1e+100", {"y": factor * Y}) for factor in (1e300, 1e-300)],
-        ("start is 'steady'; use 'zero', 'given', 'estimated' or", {"start": "steady"}),
+        ("start is 'steady'; use 'zero', 'given', 'estimated', 'measured' or", {"start": "steady"}),
         ("skip is -1; give a whole number of at least 0", {"skip": -1}),
         *[(f"skip={skip} leaves no sample of 10;", {"skip": skip}) for skip in (10, 11)],
         ("input has shape (2, 30): more channels than samples.", {"u": np.ones((2, 30))}),

@@ -70,7 +70,7 @@ def _geodesic(y_hat: Float[Array, "n h 12"], y: Float[Array, "n h 12"]) -> Float
         return Rotation.from_euler("xyz", signal[..., _ANGLES].reshape(-1, 3))
 
     there = np.asarray(np.isfinite(y_hat).all(axis=-1))
-    y_hat = np.broadcast_to(np.where(np.expand_dims(there, -1), y_hat, 0.0), y.shape)
+    y_hat = np.where(np.expand_dims(there, -1), y_hat, 0.0)
     angle = (attitude(y_hat) * attitude(y).inv()).magnitude().reshape(y.shape[:2])
     return np.where(there, angle, np.inf)
 

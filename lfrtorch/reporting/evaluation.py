@@ -176,11 +176,12 @@ class Evaluation:
         models = {name: each for name, each in models.items() if each is not None}
         measured = np.lib.stride_tricks.sliding_window_view(record.y, horizon, axis=0)[1:]
         measured = measured.transpose(0, 2, 1)
+        held = np.broadcast_to(record.y[:-horizon, None], measured.shape)
         of = {name: each.ahead(record, horizon) for name, each in models.items()}
         sums = {
             measure: {
                 name: float(error(y_hat, measured).mean(axis=0).sum())
-                for name, y_hat in {_HOLD: record.y[:-horizon, None], **of}.items()
+                for name, y_hat in {_HOLD: held, **of}.items()
             }
             for measure, error in (self.dataset.ahead if use != "train" else {}).items()
         }

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import lfrtorch
 from lfrtorch import InputError
 from lfrtorch.cli.composition import composed
 from lfrtorch.datasets import nanodrone
 from lfrtorch.known_systems import nanodrone as equations
+from lfrtorch.reporting.scores import sums_table
 
 
 def write(folder: Path, name: str, samples: int = 80, seed: int = 0) -> None:
@@ -100,6 +102,22 @@ def test_the_body_turns_as_rotations_do() -> None:
     thrust = static.physical["thrust"] * 4 * 1.75**2
     pull = Rotation.from_euler("xyz", z[6:9]).apply([0.0, 0.0, thrust]) - [0.0, 0.0, 9.81]
     np.testing.assert_allclose(w[3:6], 0.01 * pull, atol=1e-12)
+
+
+def test_a_run_has_the_sums_of_the_kind_that_is_left_out(flights: Path) -> None:
+    data = nanodrone.load(root=flights, left_out="random")
+    short = lfrtorch.LevenbergMarquardt(max_iter=2)
+    settings = lfrtorch.Settings(known=equations(), nx=0, nn=0, horizon=10, trainer=short)
+    run = lfrtorch.identify(data, settings)
+    score = run.metrics["scores"]["random"]
+    y = [record.y for record in data.tests]
+    moved = [
+        np.linalg.norm((one[h:] - one[:-h])[:70, :3], axis=1) for one in y for h in range(1, 11)
+    ]
+    assert score["hold_position"] == pytest.approx(sum(each.mean() for each in moved) / 2)
+    assert all(score[name] > 0 for name in nanodrone.MEASURES)
+    assert score["records"] == 2
+    assert "position" in sums_table(run.metrics, ())
 
 
 def test_the_benchmark_has_its_equations_and_horizon() -> None:

@@ -179,7 +179,7 @@ def test_starts_that_it_does_not_have():
     lfr, u = small(), normal(1, 10, 2)
     with pytest.raises(ValueError, match="start is 'peridoic'"):
         lfr(u, None, "peridoic")
-    with pytest.raises(ValueError, match="start='estimated' is fitted to a record's output"):
+    with pytest.raises(ValueError, match="start='estimated' needs a record's output"):
         lfr(u, None, "estimated")
 
 
