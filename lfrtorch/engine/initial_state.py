@@ -85,10 +85,18 @@ def measured_start(
     cell: LFRCell, u: Float[Tensor, "R nu"], y: Float[Tensor, "R ny"]
 ) -> Float[Tensor, "R nx"]:
     """The state nearest to rest whose output is the measured one, or nearest to it."""
-    u, y = u.unsqueeze(1), y.unsqueeze(1)
-    rest = simulate(cell, u, u.new_zeros(len(u), cell.nx))
-    free = u.new_zeros(len(u), cell.nx, cell.nx)
-    return _fitted_start(cell, u, y, torch.ones_like(y), free, rest).x[:, 0]
+    x = u.new_zeros(len(u), cell.nx)
+    for _ in range(ITERATIONS):
+        z, w = cell.internal(u, x)
+        error = y - (x @ cell.Cy.mT + u @ cell.Dyu.mT + w @ cell.Dyw.mT)
+        H = linearise(cell, z.unsqueeze(1)).H.squeeze(1)
+        if not torch.isfinite(H).all():
+            break
+        step = (torch.linalg.pinv(H, rtol=_SEEN) @ error.unsqueeze(-1)).squeeze(-1)
+        x = x + step
+        if not (step.abs() > _TOLERANCE * (1.0 + x.abs())).any():
+            break
+    return x
 
 
 @torch.no_grad()

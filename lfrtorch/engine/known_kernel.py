@@ -60,14 +60,26 @@ def known_step(z, of_z, of_w, p, f, h, nx, method, step, substeps, before, work,
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def known_slopes(
-    r, z, of_z, of_w, p, p_scale, f, h, nx, method, step, substeps, before, by_z, by_p
+    part, parts, z, of_z, of_w, p, p_scale, f, h, nx, method, step, substeps, before, by_z, by_p
 ):  # fmt: skip
-    """Write ∂w/∂z and ∂w/∂p of all samples of record r.
+    """Write ∂w/∂z and ∂w/∂p of all samples of every ``parts``-th record.
+
+    One call has many records: to hand over ``f`` and ``h`` takes as long as 100 samples.
 
     Shape:
         z: (R, T, nz), by_z: (R, T, nw, nz), by_p: (R, T, nw, p).
     """
-    z, by_z, by_p = z[r], by_z[r], by_p[r]
+    for r in range(part, len(z), parts):
+        _slopes(
+            z[r], of_z, of_w, p, p_scale, f, h, nx, method, step, substeps, before, by_z[r], by_p[r]
+        )
+
+
+@njit(nogil=True, error_model="numpy")
+def _slopes(
+    z, of_z, of_w, p, p_scale, f, h, nx, method, step, substeps, before, by_z, by_p
+):  # fmt: skip
+    """The same of one record."""
     nz, nw = z.shape[1], by_z.shape[1]
     q = nz + len(p)
     v, x = np.empty(q), np.empty(nx)
@@ -141,16 +153,28 @@ def _chained(f, v, of_f, S, K):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def simulate_known_record(
-    r, u, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth,
+def simulate_known_records(
+    part, parts, u, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth,
     of_z, of_w, p, f, h, n_states, method, step, substeps, before, met_within, x, z, w, y,
 ):  # fmt: skip
-    """Simulate record r of a static map that is a known model and then a network or polynomial.
+    """Simulate every ``parts``-th record; see ``_simulate``."""
+    for r in range(part, len(u), parts):
+        _simulate(
+            u[r], A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth, of_z, of_w,
+            p, f, h, n_states, method, step, substeps, before, met_within, x[r], z[r], w[r], y[r],
+        )  # fmt: skip
+
+
+@njit(nogil=True, error_model="numpy", fastmath={"contract"})
+def _simulate(
+    u, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth,
+    of_z, of_w, p, f, h, n_states, method, step, substeps, before, met_within, x, z, w, y,
+):  # fmt: skip
+    """Simulate a record of a static map that is a known model and then a network or polynomial.
 
     All else is as in ``simulation_kernel.simulate_record``, and written again: in functions that
     both call, the recurrence of a network takes 1.4 times as long.
     """
-    u, x, z, w, y = u[r], x[r], z[r], w[r], y[r]
     neurons, work = np.empty(Ww.shape[1]), np.empty((5, len(of_z) + len(p) + len(of_w)))
     known_z, known_w = np.empty(len(of_z)), np.empty(len(of_w))
     first, last = len(known_z), len(known_w)

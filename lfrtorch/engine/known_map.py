@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import Module, Parameter
 
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.threads import has_kernels, spread, to_numpy
+from lfrtorch._support.threads import has_kernels, spread, to_numpy, workers
 from lfrtorch.engine.formula_code import machine_code
 from lfrtorch.engine.known_kernel import DISCRETE, EULER, RK4, known_slopes
 from lfrtorch.engine.operations import Formula, Symbol
@@ -211,7 +211,9 @@ class KnownJacobian:
         self._by_p = z.new_empty(R, T, of.nw, len(p))
         scaling = [*of.arguments(p), to_numpy(of.p_scale)]
         outputs = self.J.numpy(), self._by_p.numpy()
-        spread(known_slopes, R, to_numpy(z), *scaling, *of.kernel(slopes=True), *outputs)
+        parts = min(R, workers())
+        formulas = of.kernel(slopes=True)
+        spread(known_slopes, parts, parts, to_numpy(z), *scaling, *formulas, *outputs)
 
     def part(self, records: slice, time: slice) -> StaticJacobian:
         """The same for some of the records and samples."""

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch._support.threads import has_kernels, spread, to_numpy
+from lfrtorch._support.threads import has_kernels, spread, to_numpy, workers
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.feedback_recurrence import monodromy
-from lfrtorch.engine.known_kernel import simulate_known_record
+from lfrtorch.engine.known_kernel import simulate_known_records
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.engine.newton import newton_states
 from lfrtorch.engine.nonlinearity import (
@@ -241,7 +241,8 @@ def _compiled(
     if (parts := known_parts(cell.static)) is not None:
         model, learned = parts
         weights = [*kernel_arguments(cell, learned), *model.arguments(), *model.kernel()]
-        spread(simulate_known_record, R, to_numpy(u), *weights, met_within, *out)
+        parts = min(R, workers())
+        spread(simulate_known_records, parts, parts, to_numpy(u), *weights, met_within, *out)
         return near
     spread(simulate_record, R, to_numpy(u), *kernel_arguments(simulated), met_within, *out)
     return near if simulated is cell else signals(cell, u, near.x)

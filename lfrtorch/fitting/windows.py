@@ -18,7 +18,9 @@ No constraint joins a window to the next one.
 Where outputs tell the states (``start="measured"``) a window begins at an output, with nothing to
 estimate: the error over it is that of predictions 1 to h samples ahead. It is weighed by that of
 holding the output, in each record: errors that grow fast, as those of rates do, would hide the
-others. Outputs of one unit have one weight.
+others. Outputs of one unit have one weight. Errors are about as large as what moves, so windows
+weigh by the inverse of that, and their squares count as absolute values do: otherwise the few in
+which a manoeuvre ends badly would decide.
 
 Windows of the validation records choose the iterate, each simulated from a state that is fitted to
 samples before it, so that no error is of a sample that its state was fitted to. A whole simulation
@@ -49,6 +51,11 @@ BEFORE = 20
 """Outputs for each state before a window of validation. Of good models of the wells in
 ``benchmarks/horizon.py``, with two states, 40 samples told the start of 81 of 81 windows, 50 of 78,
 and 100 of 61 of 84: where small changes grow, the error over more samples has many minima."""
+
+
+_STILL = 0.1
+"""Squared motion of a window, relative to its record's, that adds to its own: one at rest is no
+better than others."""
 
 
 def windows(
@@ -97,7 +104,14 @@ def from_outputs(record: Record, horizon: int, apart: int, y_scale: Array | None
     if y_scale is not None:
         weight = weight * (y_scale / _held(record, horizon)) ** 2
     whole = replace(record, period=None, weight=weight, skip=0)
-    return [replace(whole, **record.signals_in(slice(b, b + horizon + 1)), skip=1) for b in begins]
+    found = [replace(whole, **record.signals_in(slice(b, b + horizon + 1)), skip=1) for b in begins]
+    if y_scale is None:
+        return found
+    scale = _held(record, horizon)
+    squares = np.array([np.mean(((each.y[1:] - each.y[0]) / scale) ** 2) for each in found])
+    own = 1.0 / np.sqrt(squares + _STILL)
+    own /= own.mean()
+    return [replace(each, weight=weight * w) for each, w in zip(found, own, strict=True)]
 
 
 def _held(record: Record, horizon: int) -> Array:

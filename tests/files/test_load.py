@@ -683,8 +683,8 @@ def test_refused_periods(tmp_path, signals):
     refused("has 300 samples and a period of 301; it must hold at least one", path, use=PERIODIC,
             period=301)  # fmt: skip
     refused("period is 0", path, use=PERIODIC, period=0)
-    refused("start is 'given'; give 'auto', 'zero', 'estimated', 'periodic' or 'measured'", path, use=PERIODIC,
-            start="given")  # fmt: skip
+    wanted = "start is 'given'; give 'auto', 'zero', 'estimated', 'periodic' or 'measured'"
+    refused(wanted, path, use=PERIODIC, start="given")
     write(path, signals)
     refused("start is 'periodic' and the input of .* does not repeat", path, start="periodic")
 
