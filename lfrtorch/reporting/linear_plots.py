@@ -36,6 +36,9 @@ STRETCHES = 200
 """Parts of the frequency axis: a variance is drawn as its mean over each. Line by line it hid the
 dots of a record of 50000 samples."""
 
+_COLOURS = 10
+"""Most pairs of an output and an input whose zeros have a colour and a name each."""
+
 _FAR = 2.0  # half width of the z plane that is drawn: sampling puts zeros far out that say little
 
 
@@ -102,6 +105,8 @@ def poles_and_zeros(model: LinearModel) -> Figure:
     ax.axhline(0, lw=0.5, color="0.8", zorder=0)
     ax.axvline(0, lw=0.5, color="0.8", zorder=0)
     found = zeros(model)
+    if len(found) > _COLOURS:
+        found = {"of every pair": np.concatenate(list(found.values()))}
     for k, (channel, values) in enumerate(found.items()):
         label = f"zeros {channel}" if channel else "zeros"
         colour = MEASURED if len(found) == 1 else f"C{k % 10}"

@@ -173,6 +173,17 @@ def test_poles_and_zeros_are_where_the_model_has_them():
     assert {"zeros x/a", "zeros phi/c", "poles"} <= set(channels)
 
 
+def test_zeros_of_many_pairs_have_one_name():
+    many = replace(
+        MODEL, C=np.tile(MODEL.C, (2, 1)), D=np.tile(MODEL.D, (2, 1)),
+        outputs=tuple(map(Channel, "stvw")),
+        y_offset=np.zeros(4), covariance=None,
+    )  # fmt: skip
+    ax = linear_plots.poles_and_zeros(many).axes[0]
+    assert labels(ax) == ["zeros of every pair", "poles"]
+    assert len(drawn(ax, "zeros of every pair")) > len(drawn(ax, "poles"))
+
+
 def test_zeros_far_out_are_counted():
     far = replace(SISO, D=np.array([[1e-3]]))
     assert np.abs(far.zeros()).max() > linear_plots._FAR
