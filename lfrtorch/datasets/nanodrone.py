@@ -37,6 +37,7 @@ __all__ = ["load"]
 
 _FOLDER = "nanodrone"
 _KINDS = ("chirp", "random", "square")  # of flights for estimation
+_TEST = "melon"  # the kind of the test's
 HORIZON = 50
 """Samples ahead that are scored."""
 
@@ -133,15 +134,12 @@ def load(
     records = {kind: [_flight(path) for path in found] for kind, found in flights.items()}
     scored = [_flight(path) for path in tests]
     last = {kind: len(found) - validation for kind, found in records.items()}
-    kinds: dict[str, list[str]] = {}
-    for record in scored:
-        kinds.setdefault(record.name.split("_")[0], []).append(record.name)
     return Dataset(
         name="nanodrone",
         train=[r for kind, found in records.items() for r in found[: last[kind]]],
         validation=[r for kind, found in records.items() for r in found[last[kind] :]],
         tests=scored,
-        groups={kind: tuple(names) for kind, names in kinds.items()},
+        groups={left_out or _TEST: tuple(r.name for r in scored)} if scored else {},
         ahead=MEASURES,
         published=() if left_out else tuple(_PUBLISHED),
         notes=notes,

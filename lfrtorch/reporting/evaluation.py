@@ -51,6 +51,7 @@ class Score:
     records: int = 1
     sums: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Errors summed over the samples of a horizon, by measure and by model."""
+    ahead: int | None = None  # how far predictions are ahead whose errors these are
 
     def entry(self) -> dict[str, Any]:
         """For ``metrics.json``: errors of each output and the number of records if several."""
@@ -65,6 +66,7 @@ class Score:
             found["lti_rmse_by_output"] = list(self.lti_rmse_by_output)
         if self.records > 1:
             found["records"] = self.records
+        found |= {} if self.ahead is None else {"ahead": self.ahead}
         names = {_NL_LFR: "", _LINEAR: "lti_", _HOLD: "hold_"}
         for measure, by_model in self.sums.items():
             found |= {names[name] + measure: error for name, error in by_model.items()}
@@ -80,6 +82,7 @@ class Response:
     simulated: Mapping[str, Array]  # outputs (T, ny) by "linear" and "NL-LFR", one or both
     start_error: float | None = None
     sums: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by measure and model
+    ahead: int | None = None  # samples that outputs are predicted ahead; else they are simulated
 
     @property
     def y_linear(self) -> Array:
@@ -136,6 +139,7 @@ class Response:
             std_by_output=tuple(std),
             start_error=self.start_error,
             sums=self.sums,
+            ahead=self.ahead,
         )
 
 
@@ -189,7 +193,8 @@ class Evaluation:
             name: record.shown(np.concatenate([record.y[:1], y_hat[0, :-1], y_hat[:, -1]]))
             for name, y_hat in of.items()
         }
-        return Response(replace(record, skip=max(record.skip, horizon)), use, shown, sums=sums)
+        scored = replace(record, skip=max(record.skip, horizon))
+        return Response(scored, use, shown, sums=sums, ahead=horizon)
 
     @cached_property
     def predictions(self) -> dict[int, list[Response]]:

@@ -168,7 +168,10 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     rows = in_units(rows, others)
     head, cells, _ = columns("terminal", rows, linear=linear, published=others)
     units = {row.unit for row in rows}
-    title = f"Simulation RMSE{f' ({unit})' if len(units) == 1 and (unit := units.pop()) else ''}"
+    listed = [*result["scores"].values(), *result["validation"]["records"].values()]
+    ahead = next((s["ahead"] for s in listed if "ahead" in s), None)
+    title = "Simulation RMSE" if ahead is None else f"RMSE of predictions {ahead} samples ahead"
+    title += f" ({unit})" if len(units) == 1 and (unit := units.pop()) else ""
     if not rows:
         return f"{title}, {shown}: nothing is scored, as there is no test and no validation record"
     references = [
