@@ -301,8 +301,8 @@ def scored_run(
         left_out=() if choice is None else cross_validated(choice.left_out),
     )
     judged = simulations = evaluation.simulations
+    ahead = settings.horizon if begins_at_outputs(dataset.train) else None
     if settings.noise == "output" or (choice is not None and not dataset.tests):
-        ahead = settings.horizon if begins_at_outputs(dataset.train) else None
         error = "error" if ahead is None else f"error {ahead} samples ahead"
         verdict = judge(result, simulations, linear_nx=linear.nx, error=error)
     else:
@@ -322,7 +322,7 @@ def scored_run(
         noise_rms=dataset.noise_rms,
         continued=settings.init_from is not None,
         ridge=settings.ridge != 0.0,
-        searched=choice is not None,
+        searched=choice is not None or ahead is not None,
         trainer=settings.trainer,
         verdict=verdict,
     )
