@@ -234,6 +234,11 @@ def _of_outputs(settings: Settings, ny: int) -> Settings:
             f"{', '.join(settings.searched)}: auto, and sizes are not searched with "
             "start='measured' yet; give numbers."
         )
+    if settings.structure != "free":
+        raise InputError(
+            f"structure is {settings.structure!r}, and with start='measured' the outputs are the "
+            "states, which no structure has; give structure='free', or start='estimated'."
+        )
     if settings.known_states or settings.nx == ny:
         return settings
     if settings.nx != "auto":
