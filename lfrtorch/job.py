@@ -150,7 +150,7 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     if from_outputs:
         linear, order_scan = measured_states_model(dataset.train), None
         tell(linear, observer)
-        settings = _of_outputs(settings, linear.nx)
+        settings = _of_outputs(settings, dataset)
         stage = replace(stage, settings=settings)
     else:
         approximated = linear_records(dataset.train, linearly, observer)
@@ -227,8 +227,15 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     )
 
 
-def _of_outputs(settings: Settings, ny: int) -> Settings:
-    """The settings of a model whose states are the outputs."""
+def _of_outputs(settings: Settings, dataset: Dataset) -> Settings:
+    """The settings of a model whose states are the outputs; refuse what cannot be scored so."""
+    ny, horizon = len(dataset.train[0].outputs), settings.horizon or 0
+    for record in (*dataset.train, *dataset.validation, *dataset.selection, *dataset.tests):
+        if record.samples <= horizon:
+            raise InputError(
+                f"record '{record.name}' has {record.samples} samples and horizon is {horizon}; "
+                "give a longer record or a shorter horizon."
+            )
     if settings.searched:
         raise InputError(
             f"{', '.join(settings.searched)}: auto, and sizes are not searched with "

@@ -20,6 +20,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +56,7 @@ OUTPUTS = tuple(
 _ANGLES = slice(6, 9)
 
 
-def _euclidean(first: int):
+def _euclidean(first: int) -> Callable[[Array, Array], Array]:
     """The error of three outputs from the first on."""
 
     def error(y_hat: Float[Array, "n h 12"], y: Float[Array, "n h 12"]) -> Float[Array, "n h"]:

@@ -135,7 +135,8 @@ def fit(
             writes it from a linear model of ``estimate_bla(..., refine="prediction")``.
         horizon: samples of the windows that training records are cut into, each simulated from a
             start state that is fitted with the parameters (``lfrtorch.fitting.windows``). Errors
-            are then those in windows. Default: whole records.
+            are then those in windows. Windows of records with a measured start begin at outputs.
+            Default: whole records.
         average: most starts that the model of the result is the mean of
             (:func:`lfrtorch.mean_model`); at least this many go to the end. As many of the best are
             averaged as bring the mean within 1 % of the least error on validation and selection,

@@ -195,6 +195,12 @@ def test_outputs_that_are_fitted_tell_no_states(flights: Dataset) -> None:
         lfrtorch.identify(flights, Settings(known=scaled, horizon=HORIZON))
 
 
+def test_a_record_within_the_horizon_is_refused_before_the_fit(flights: Dataset) -> None:
+    short = replace(flights, tests=[flights.tests[0][:HORIZON]])
+    with pytest.raises(InputError, match=f"has {HORIZON} samples and horizon is {HORIZON}"):
+        lfrtorch.identify(short, Settings(known=known(), horizon=HORIZON))
+
+
 def test_other_starts_beside_measured_ones_are_refused(flights: Dataset) -> None:
     (one,) = flights.train
     mixed = Dataset("mixed", [one, replace(one, start="zero", name="rest")], [], [])
