@@ -24,7 +24,7 @@ from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Stage
 from lfrtorch.fitting.trainer import StoppedError
-from lfrtorch.fitting.windows import from_outputs, windows
+from lfrtorch.fitting.windows import windows, windows_from_outputs
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model import Model
 from lfrtorch.records import Record
@@ -69,11 +69,10 @@ def with_measured_states(model: Model) -> Model:
         for name in ("A", "Bu", "Bw", "Cz"):
             cell.get_parameter(name).copy_(torch.as_tensor(found[name]))
         cell.Cy.copy_(torch.eye(cell.nx))
-        for name in ("Cy", "Dyu", "Dyw"):
-            matrix = cell.get_parameter(name)
-            if name != "Cy":
-                matrix.zero_()
-            cell.fix(name, torch.ones_like(matrix, dtype=torch.bool))
+        cell.Dyu.zero_()
+        cell.Dyw.zero_()
+    for name in ("Cy", "Dyu", "Dyw"):
+        cell.fix(name, torch.ones_like(cell.get_parameter(name), dtype=torch.bool))
     return replace(model, lfr=type(model.lfr)(cell))
 
 
@@ -89,7 +88,7 @@ def begun_on_short_windows(
     for horizon in sorted({max(2, round(part * settings.horizon)) for part in _PARTS}):
         monitor = observer.searching()
         # As many windows as there will be whole ones: these iterations cost so much less.
-        cut = [from_outputs(r, horizon, settings.horizon, scale) for r in dataset.train]
+        cut = [windows_from_outputs(r, horizon, settings.horizon, scale) for r in dataset.train]
         short = LevenbergMarquardt(max_iter=_ITERATIONS)
         result = fit(
             found,

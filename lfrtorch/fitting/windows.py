@@ -76,7 +76,7 @@ def windows(
     found = []
     for record in records:
         if record.start == "measured":
-            found += from_outputs(record, horizon, horizon, y_scale)
+            found += windows_from_outputs(record, horizon, horizon, y_scale)
             continue
         if record.samples - record.skip <= horizon:
             found.append(record)
@@ -96,13 +96,14 @@ def windows(
     return found
 
 
-def from_outputs(record: Record, horizon: int, apart: int, y_scale: Array | None) -> list[Record]:
+def windows_from_outputs(
+    record: Record, horizon: int, apart: int, y_scale: Array | None
+) -> list[Record]:
     """Windows that begin at measured outputs, with the weight of the record's samples together."""
+    record.require_all_valid("a fit from measured outputs")
     last = max(record.samples - 1 - horizon, 0)
     begins = np.linspace(0, last, 1 + math.ceil(last / apart)).round().astype(int)
     weight = np.asarray(record.weight) * (record.samples - 1) / (len(begins) * horizon)
-    if y_scale is not None:
-        weight = weight * (y_scale / _held(record, horizon)) ** 2
     whole = replace(record, period=None, weight=weight, skip=0)
     found = [replace(whole, **record.signals_in(slice(b, b + horizon + 1)), skip=1) for b in begins]
     if y_scale is None:
@@ -111,6 +112,7 @@ def from_outputs(record: Record, horizon: int, apart: int, y_scale: Array | None
     squares = np.array([np.mean(((each.y[1:] - each.y[0]) / scale) ** 2) for each in found])
     own = 1.0 / np.sqrt(squares + _STILL)
     own /= own.mean()
+    weight = weight * (y_scale / scale) ** 2
     return [replace(each, weight=weight * w) for each, w in zip(found, own, strict=True)]
 
 

@@ -201,6 +201,13 @@ def test_a_record_within_the_horizon_is_refused_before_the_fit(flights: Dataset)
         lfrtorch.identify(short, Settings(known=known(), horizon=HORIZON))
 
 
+def test_no_window_begins_at_an_output_that_is_not_valid(flights: Dataset) -> None:
+    (one,) = flights.train
+    gap = replace(one, valid=np.arange(one.samples) != 100)
+    with pytest.raises(InputError, match="a fit from measured outputs needs all of them"):
+        lfrtorch.identify(replace(flights, train=[gap]), Settings(known=known(), horizon=HORIZON))
+
+
 def test_other_starts_beside_measured_ones_are_refused(flights: Dataset) -> None:
     (one,) = flights.train
     mixed = Dataset("mixed", [one, replace(one, start="zero", name="rest")], [], [])
