@@ -10,8 +10,12 @@ sums over these 50 samples of the mean error: Euclidean for position, velocity a
 between the two attitudes for the third.
 
 Four flights each of three kinds, squares, chirps and random ones, are for estimation, three of a
-fourth kind, melon, for the test. The release has quaternions and accelerations in CSV files; what
-is read here are the arrays u (N, 4) and y (N, 12) of ``.npz`` files with the sampling frequency fs.
+fourth kind, melon, for the test. Files are those of the release, ``train/chirp_20251017_run1.csv``
+and so on, with quaternions for the attitude, or ``train_chirp_run1.npz`` with arrays u (N, 4) and
+y (N, 12) and the sampling frequency fs. The reader of CSV files was made after the description of
+the release and tried on files of that form, not on the release itself.
+
+A submission to the site is the four sums of ``melon``, the means of its flights.
 
 References:
     Busetto et al., "NanoDrone: a benchmark for the identification of an aerial robot", Control
@@ -39,6 +43,10 @@ __all__ = ["load"]
 _FOLDER = "nanodrone"
 _KINDS = ("chirp", "random", "square")  # of flights for estimation
 _TEST = "melon"  # the kind of the test's
+_HOLDS = {
+    ".npz": "arrays u, y and fs",
+    ".csv": "columns t, x, y, z, qx to qw, vx to vz, wx to wz and m1_rads to m4_rads",
+}
 HORIZON = 50
 """Samples ahead that are scored."""
 
@@ -104,8 +112,8 @@ def load(
         validation: flights of each kind that choose the iterate, the last ones.
         left_out: a kind of flight, ``"chirp"``, ``"random"`` or ``"square"``, that is not for
             estimation but a test, in place of the official one.
-        root: folder that holds ``nanodrone/train_*.npz``, as ``train_chirp_run1.npz``, and
-            ``nanodrone/test_*.npz``.
+        root: folder that holds ``nanodrone/train_*.npz`` and ``nanodrone/test_*.npz``, or the
+            folders ``nanodrone/train/`` and ``nanodrone/test/`` of the release.
 
     Shape:
         u: (T, 4), y: (T, 12), T about 6000, or 1900 of squares.
@@ -117,21 +125,21 @@ def load(
     if left_out is not None and left_out not in _KINDS:
         raise InputError(f"left_out is {left_out!r}; give one of {', '.join(_KINDS)}, or None.")
     folder = official.folder(root) / _FOLDER
-    flights = {kind: sorted(folder.glob(f"train_{kind}_*.npz")) for kind in _KINDS}
+    flights = {kind: _files(folder, "train", kind) for kind in _KINDS}
     missing = [kind for kind, found in flights.items() if len(found) <= validation]
     if missing:
         raise FileNotFoundError(
             f"'{folder}' holds {', '.join(f'{len(flights[k])} flights {k}' for k in missing)} "
             f"and {validation} of each kind validate; give the folder above nanodrone/ with "
-            "train_chirp_run1.npz, ... as root=DIR."
+            "train_chirp_run1.npz, ... or train/chirp_20251017_run1.csv, ... as root=DIR."
         )
-    tests = sorted(folder.glob("test_*.npz"))
+    tests = _files(folder, "test", "")
     notes: tuple[str, ...] = ()
     if left_out is not None:
         tests = flights.pop(left_out)
         notes = (f"no official test: the flights {left_out} are left out of the estimation",)
     elif not tests:
-        notes = ("no flight of the test is here (test_*.npz): nothing is scored",)
+        notes = ("no flight of the test is here (test_*.npz or test/*.csv): nothing is scored",)
     records = {kind: [_flight(path) for path in found] for kind, found in flights.items()}
     scored = [_flight(path) for path in tests]
     last = {kind: len(found) - validation for kind, found in records.items()}
@@ -147,14 +155,20 @@ def load(
     )
 
 
+def _files(folder: Path, use: str, kind: str) -> list[Path]:
+    """The flights of one kind, as arrays or as the release has them."""
+    arrays = sorted(folder.glob(f"{use}_{kind}*.npz"))
+    return arrays or sorted((folder / use).glob(f"{kind}*.csv"))
+
+
 def _flight(path: Path) -> Record:
     """One file as a record."""
+    read = _released if path.suffix == ".csv" else _arrays
     try:
-        with np.load(path, allow_pickle=False) as file:
-            u, y, fs = (np.asarray(file[name], dtype=np.float64) for name in ("u", "y", "fs"))
+        u, y, fs = (np.array(part, dtype=np.float64) for part in read(path))
     except Exception as error:  # a damaged file makes numpy raise any of several kinds
         raise InputError(
-            f"'{path}' holds no readable arrays u, y and fs ({error!r}); {official.again(path)}"
+            f"'{path}' holds no readable {_HOLDS[path.suffix]} ({error!r}); {official.again(path)}"
         ) from error
     if u.ndim != 2 or y.ndim != 2 or u.shape[1:] != (4,) or y.shape != (len(u), 12) or len(u) < 2:
         raise InputError(
@@ -163,7 +177,28 @@ def _flight(path: Path) -> Record:
         )
     u[0] = np.where(np.isfinite(u[0]), u[0], u[1])
     y[:, _ANGLES] = np.unwrap(y[:, _ANGLES], axis=0)
-    name = path.stem.split("_", 1)[1]
+    name = path.stem.removeprefix("train_").removeprefix("test_")
     return Record(
         u, y, float(fs), "measured", name=name, source="official", inputs=INPUTS, outputs=OUTPUTS
     )
+
+
+def _arrays(path: Path) -> tuple[Array, Array, Array]:
+    """The u, y and fs of an archive of arrays."""
+    with np.load(path, allow_pickle=False) as file:
+        return file["u"], file["y"], file["fs"]
+
+
+def _released(path: Path) -> tuple[Array, Array, float]:
+    """The u, y and fs of a file of the release."""
+    with path.open() as file:
+        names = file.readline().strip().split(",")
+        table = np.genfromtxt(file, delimiter=",", dtype=np.float64).reshape(-1, len(names))
+
+    def columns(*wanted: str) -> Array:
+        return table[:, [names.index(name) for name in wanted]]
+
+    attitude = Rotation.from_quat(columns("qx", "qy", "qz", "qw")).as_euler("xyz")
+    y = [columns("x", "y", "z", "vx", "vy", "vz"), attitude, columns("wx", "wy", "wz")]
+    u = columns(*(f"m{i}_rads" for i in range(1, 5)))
+    return u, np.hstack(y), float(1.0 / np.median(np.diff(columns("t"), axis=0)))

@@ -53,6 +53,42 @@ def test_flights_by_kind(flights: Path) -> None:
     assert tested.published[0].scores["melon position"] == 2.322
 
 
+def test_files_of_the_release_say_the_same(flights: Path) -> None:
+    """Their quaternions are the angles of the arrays."""
+    expected = nanodrone.load(root=flights).train[0]
+    released = flights / "release" / "nanodrone"
+    for use, kinds in (("train", ("chirp", "random", "square")), ("test", ("melon",))):
+        (released / use).mkdir(parents=True)
+        for kind in kinds:
+            for run in (1, 2):
+                u, y = expected.u.copy(), expected.y
+                u[0] = np.nan  # as in the release
+                attitude = Rotation.from_euler("xyz", y[:, 6:9]).as_quat()
+                t = 0.01 * np.arange(len(u))[:, None]
+                acceleration = np.zeros((len(u), 3))
+                columns = [t, y[:, :3], attitude, y[:, 3:6], y[:, 9:], u, acceleration]
+                np.savetxt(
+                    released / use / f"{kind}_20251017_run{run}.csv",
+                    np.hstack(columns),
+                    delimiter=",",
+                    comments="",
+                    header="t,x,y,z,qx,qy,qz,qw,vx,vy,vz,wx,wy,wz,m1_rads,m2_rads,m3_rads,m4_rads,"
+                    "ax_body,ay_body,az_body",
+                )
+    data = nanodrone.load(root=flights / "release")
+    assert data.groups == {"melon": ("melon_20251017_run1", "melon_20251017_run2")}
+    record = data.train[0]
+    assert record.fs == pytest.approx(100.0)
+    np.testing.assert_allclose(record.u, expected.u)
+    tilt = np.abs(expected.y[:, 7]).max()
+    assert tilt < np.pi / 2, "the pitch of the test's flight is one that angles tell"
+    np.testing.assert_allclose(np.exp(1j * record.y), np.exp(1j * expected.y), atol=1e-9)
+    path = released / "train" / "chirp_20251017_run1.csv"
+    path.write_text("t,x\n0,1\n1,2\n")
+    with pytest.raises(InputError, match="holds no readable columns t, x, y, z, qx to qw"):
+        nanodrone.load(root=flights / "release")
+
+
 def test_a_kind_that_is_left_out_is_the_test(flights: Path) -> None:
     data = nanodrone.load(root=flights, left_out="random")
     assert {r.name.split("_")[0] for r in (*data.train, *data.validation)} == {"chirp", "square"}
