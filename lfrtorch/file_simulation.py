@@ -41,11 +41,7 @@ def estimated_start(
 ) -> Start:
     """Return the most probable start state, given the first measured outputs, not scored then."""
     # ``samples``: how many are looked at; those that the user skips, or as many as of a record.
-    if not stream.y:
-        raise InputError(
-            "start=estimated needs measured outputs; name their columns with data.outputs=[...], "
-            "or use start=zero."
-        )
+    _require_outputs(stream, "estimated")
     asked = samples or skip
     u, y = _beginning(stream, asked or PART * WINDOW)
     if not len(u):
@@ -62,6 +58,29 @@ def estimated_start(
         f"{there}, from zero state {at_rest} (they are not scored)"
     )
     return Start(trajectory.x[0, 0].numpy(), max(len(u), skip or 0), note)
+
+
+def measured_start(model: Model, stream: FileStream, *, skip: int | None = None) -> Start:
+    """The state that the first measured output tells; that sample is not scored."""
+    _require_outputs(stream, "measured")
+    u, y = _beginning(stream, 2)
+    if len(u) < 2 or not np.isfinite(y[0]).all():
+        raise InputError(
+            f"start=measured needs two samples and all outputs of the first, and "
+            f"'{stream.table.path}' has {len(u)} that begin with {y[:1].tolist()}; remove rows "
+            "at the beginning, or use start=estimated."
+        )
+    record = Record(u, y, fs=model.fs, start="measured", valid=np.isfinite(y))
+    return Start(model.signals(record).x[0, 0].numpy(), max(1, skip or 0))
+
+
+def _require_outputs(stream: FileStream, start: str) -> None:
+    """Refuse a start that outputs tell if there are none."""
+    if not stream.y:
+        raise InputError(
+            f"start={start} needs measured outputs; name their columns with data.outputs=[...], "
+            "or use start=zero."
+        )
 
 
 def start_at_rest(stream: FileStream, *, skip: int | None = None) -> Start:

@@ -24,6 +24,7 @@ from lfrtorch.file_simulation import (
     Simulated,
     Start,
     estimated_start,
+    measured_start,
     notes_on,
     simulate_file,
     start_at_rest,
@@ -86,6 +87,8 @@ def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> S
         return Start(np.array(cfg.x0, dtype=np.float64), cfg.skip or 0)
     if cfg.start == "zero":
         return start_at_rest(stream, skip=cfg.skip)
+    if cfg.start == "measured":
+        return measured_start(model, stream, skip=cfg.skip)
     return estimated_start(model, stream, samples=cfg.estimate, skip=cfg.skip)
 
 
@@ -136,8 +139,10 @@ def require(cfg: DictConfig) -> None:
             raise InputError(f"{option} is not set: add {option}={example}.")
     if isinstance(cfg.out, DictConfig | ListConfig):
         raise InputError(f"out is {cfg.out}; give a file or a folder.")
-    if cfg.start not in ("zero", "given", "estimated"):
-        raise InputError(f"start is {cfg.start!r}; give zero, given (with x0=[...]) or estimated.")
+    if cfg.start not in ("zero", "given", "estimated", "measured"):
+        raise InputError(
+            f"start is {cfg.start!r}; give zero, given (with x0=[...]), estimated or measured."
+        )
     if (cfg.start == "given") != (cfg.x0 is not None):
         raise InputError(
             f"start is {cfg.start!r} and x0 is {cfg.x0}; "

@@ -247,6 +247,20 @@ def test_an_estimated_start_goes_on_where_the_measurement_was_cut(
 
 
 @pytest.mark.numeric
+def test_a_measured_start_begins_at_the_first_output(folder: Path, monkeypatch, capsys):
+    run(monkeypatch, folder, "data.path=both.csv", "out=x.npz", "start=measured")
+    found = columns(folder / "x.npz")
+    expected = MODEL.simulate(lfrtorch.Record(U, Y, 50.0, "measured"))
+    assert np.allclose(found["y1_hat"], expected[:, 0], rtol=0, atol=1e-9)
+    assert found["y1_hat"][0] == pytest.approx(Y[0, 0], abs=1e-6)
+    assert capsys.readouterr().out.count("  last 299 of 300  ") == 2
+    csv(folder / "gap.csv", u1=U[:, 0], u2=U[:, 1], y1=np.full(T, np.nan), y2=Y[:, 1])
+    with pytest.raises(SystemExit):
+        run(monkeypatch, folder, "data.path=gap.csv", "data.fs=50", "out=y.npz", "start=measured")
+    assert "needs two samples and all outputs of the first" in capsys.readouterr().err
+
+
+@pytest.mark.numeric
 def test_no_start_is_fitted_to_samples_that_are_scored(folder: Path, monkeypatch, capsys):
     for words, fitted, scored in (
         (["skip=299"], 299, "last 1 of 300"),
