@@ -66,9 +66,8 @@ def measured_start(model: Model, stream: FileStream, *, skip: int | None = None)
     u, y = _beginning(stream, 2)
     if len(u) < 2 or not np.isfinite(y[0]).all():
         raise InputError(
-            f"start=measured needs two samples and all outputs of the first, and "
-            f"'{stream.table.path}' has {len(u)} that begin with {y[:1].tolist()}; remove rows "
-            "at the beginning, or use start=estimated."
+            f"start=measured needs two samples and all outputs of the first: {len(u)} that begin "
+            f"with {y[:1].tolist()}; remove rows at the beginning, or use start=estimated."
         )
     record = Record(u, y, fs=model.fs, start="measured", valid=np.isfinite(y))
     return Start(model.signals(record).x[0, 0].numpy(), max(1, skip or 0))
