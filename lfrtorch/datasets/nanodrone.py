@@ -131,7 +131,7 @@ def load(
         raise FileNotFoundError(
             f"'{folder}' holds {', '.join(f'{len(flights[k])} flights {k}' for k in missing)} "
             f"and {validation} of each kind validate; give the folder above nanodrone/ with "
-            "train_chirp_run1.npz, ... or train/chirp_20251017_run1.csv, ... as root=DIR."
+            "train_chirp_run1.npz or train/chirp_..._run1.csv as root=DIR."
         )
     tests = _files(folder, "test", "")
     notes: tuple[str, ...] = ()
