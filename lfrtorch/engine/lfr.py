@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+import sys
+from typing import Any, Literal, overload
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.sensitivity import Linearisation
+from lfrtorch.engine.differentiable import Simulation
 from lfrtorch.engine.simulation import Trajectory, simulate, steady_state
 from lfrtorch.records import Start, check_start
+
+_UNCOMPILED: list[Any] = []
+"""The simulation as ``torch.compile`` calls it: made with the compiler's first use, which takes a
+second to import."""
 
 
 class LFR(nn.Module):
@@ -61,63 +65,78 @@ class LFR(nn.Module):
         Raises:
             ValueError: signals of other sizes, dtype or device than the weights.
         """
-        check_start(start, "simulation")
+        self._check_start(start)
         self.cell.check()
         self.cell.check_signals(u, x0, guess)
-        if start in ("estimated", "measured"):
-            raise InputError(f"start='{start}' needs a record's output: Model.simulate.")
         if start == "periodic":
             return steady_state(self.cell, u, x0 if guess is None else guess)
         zero = u.new_zeros(len(u), self.cell.nx)
         return simulate(self.cell, u, zero if x0 is None else x0, guess=guess)
+
+    @overload
+    def forward(
+        self, u: Tensor, x0: Tensor | None = ..., start: Start = ..., *,
+        return_state: Literal[False] = ...,
+    ) -> Tensor: ...  # fmt: skip
+
+    @overload
+    def forward(
+        self, u: Tensor, x0: Tensor | None = ..., start: Start = ..., *,
+        return_state: Literal[True],
+    ) -> tuple[Tensor, Tensor]: ...  # fmt: skip
 
     def forward(
         self,
         u: Tensor,
         x0: Tensor | None = None,
         start: Start = "zero",
-    ) -> Tensor:
+        *,
+        return_state: bool = False,
+    ) -> Tensor | tuple[Tensor, Tensor]:
         """Simulated output; ``backward`` costs one adjoint recurrence (no second derivatives).
 
+        Args:
+            u: input.
+            x0: initial state; a first guess in periodic steady state. Default: zero.
+            start: ``"periodic"`` for the periodic steady state; otherwise from ``x0``.
+            return_state: also return the state after the last sample, (R, nx), where a next part of
+                the signals goes on.
+
         Raises:
-            ValueError: signals of other sizes, dtype or device than the weights.
+            ValueError: signals of other sizes, dtype or device than the weights; a state that is
+                asked of a periodic steady state.
         """
+        if "torch._dynamo" in sys.modules:  # torch.compile leaves this layer as it is
+            if not _UNCOMPILED:
+                _UNCOMPILED.append(torch.compiler.disable(LFR._simulated))
+            y, end = _UNCOMPILED[0](self, u, x0, start, return_state)
+        else:
+            y, end = self._simulated(u, x0, start, return_state)
+        return (y, end) if return_state else y
+
+    def _simulated(
+        self, u: Tensor, x0: Tensor | None, start: Start, return_state: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Output and last state."""
         if isinstance(u, Tensor) and u.ndim == 2:  # one record
             x0 = x0.unsqueeze(0) if isinstance(x0, Tensor) else x0
-            return self.forward(u.unsqueeze(0), x0, start).squeeze(0)
+            y, end = self._simulated(u.unsqueeze(0), x0, start, return_state)
+            return y.squeeze(0), end.squeeze(0)
+        self._check_start(start)
+        if return_state and start == "periodic":
+            raise InputError(
+                "return_state=True with start='periodic': a period ends where it begins; give "
+                "start='zero'."
+            )
         self.cell.check_signals(u, x0)
-        weights = list(self.cell.parameters())
         if x0 is None:
             x0 = u.new_zeros(len(u), self.cell.nx)
-        return _Simulation.apply(self, start, u, x0, *weights)
-
-
-class _Simulation(torch.autograd.Function):
-    """The simulation with the adjoint recurrence as its derivative."""
+        weights = self.cell.parameters()
+        y, end, *_ = Simulation.apply(self.cell, start == "periodic", u, x0, *weights)
+        return y, end
 
     @staticmethod
-    def forward(
-        ctx: Any, lfr: LFR, start: Start, u: Tensor, x0: Tensor, *weights: Tensor
-    ) -> Tensor:
-        trajectory = lfr.trajectory(u, x0, start)
-        ctx.save_for_backward(u, x0, *weights)
-        ctx.lfr, ctx.start, ctx.trajectory = lfr, start, trajectory
-        return trajectory.y.clone()
-
-    @staticmethod
-    @once_differentiable
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx: Any, *grad_outputs: Tensor
-    ) -> tuple[Tensor | None, ...]:
-        (grad_y,) = grad_outputs
-        u, _, *weights = ctx.saved_tensors
-        periodic = ctx.start == "periodic"
-        cell = ctx.lfr.cell
-        linearisation = Linearisation(cell, u, ctx.trajectory, periodic=periodic, weights=weights)
-        adjoint = linearisation.adjoint(grad_y)
-        sizes = [p.numel() for p in weights]
-        gradients = [
-            part.reshape(p.shape)
-            for part, p in zip(adjoint.theta.sum(0).split(sizes), weights, strict=True)
-        ]
-        return None, None, adjoint.u, None if periodic else adjoint.x0, *gradients
+    def _check_start(start: Start) -> None:
+        check_start(start, "simulation")
+        if start in ("estimated", "measured"):
+            raise InputError(f"start='{start}' needs a record's output: Model.simulate.")

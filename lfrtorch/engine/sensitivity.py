@@ -234,7 +234,7 @@ class Linearisation:
         self.layout = layout(cell, every=weights is not None)
         self.parameters = self.layout.table.shape[1]
         """P."""
-        self.state = cell.A.new_zeros(len(u), cell.nx)
+        self.state = u.new_zeros(len(u), cell.nx)
         self._ny = cell.ny
         self._known_transition: tuple[Tensor, list[slice]] | None = None
 
@@ -301,37 +301,58 @@ class Linearisation:
                         self._known_transition = Phi, self._times
                 yield Rows(records, time, rows, S)
 
-    @torch.no_grad()
     def tangent(
         self, d_theta: Float[Tensor, " P"], d_x0: Float[Tensor, "R nx"] | None = None
     ) -> Float[Tensor, "R T ny"]:
         """dy of a change dθ and of the initial state, which follows if a record is periodic."""
+        return self.tangent_with_end(d_theta, d_x0)[0]
+
+    @torch.no_grad()
+    def tangent_with_end(
+        self,
+        d_theta: Float[Tensor, " P"],
+        d_x0: Float[Tensor, "R nx"] | None = None,
+        d_u: Float[Tensor, "R T nu"] | None = None,
+    ) -> tuple[Float[Tensor, "R T ny"], Float[Tensor, "R nx"]]:
+        """dy and the change of the last state, of dθ, of the initial state and of the input."""
         start = self.state if d_x0 is None else d_x0
         if self.periodic and d_x0 is None:
-            *_, (_, end) = self._changes(d_theta, start)
+            *_, (_, end) = self._changes(d_theta, start, d_u)
             Phi, _ = self._transition
             start = fixed_point(Phi, end.unsqueeze(-1)).squeeze(-1)
-        return torch.cat([d_y for d_y, _ in self._changes(d_theta, start)], dim=1)
+        d_y, ends = zip(*self._changes(d_theta, start, d_u), strict=True)
+        return torch.cat(d_y, dim=1), ends[-1]
 
     def _changes(
-        self, d_theta: Float[Tensor, " P"], s: Float[Tensor, "R nx"]
+        self,
+        d_theta: Float[Tensor, " P"],
+        s: Float[Tensor, "R nx"],
+        d_u: Float[Tensor, "R T nu"] | None = None,
     ) -> Iterator[tuple[Float[Tensor, "R _ ny"], Float[Tensor, "R nx"]]]:
         """Changes of the outputs in each block, and of the state after it."""
         d_x, d_z, d_y, d_static = self.layout.matrices(d_theta)
         W = self.weights
         for block in self._blocks():
             J, v = block.static.J, block.v
-            d_w = _apply(J, v @ d_z.mT) + block.static.tangent(d_static)
-            every = states(W, J, v @ d_x.mT + d_w @ W["Bw"].mT, s)
+            by_x, by_z, by_y = v @ d_x.mT, v @ d_z.mT, v @ d_y.mT
+            if d_u is not None:
+                part = d_u[:, block.time]
+                by_x += part @ W["Bu"].mT
+                by_z += part @ W["Dzu"].mT
+                by_y += part @ W["Dyu"].mT
+            d_w = _apply(J, by_z) + block.static.tangent(d_static)
+            every = states(W, J, by_x + d_w @ W["Bw"].mT, s)
             s, d_states = every[:, -1], every[:, :-1]
             d_w += _apply(J, d_states @ W["Cz"].mT)
-            yield d_states @ W["Cy"].mT + v @ d_y.mT + d_w @ W["Dyw"].mT, s
+            yield d_states @ W["Cy"].mT + by_y + d_w @ W["Dyw"].mT, s
 
     @torch.no_grad()
-    def adjoint(self, e: Float[Tensor, "R T ny"]) -> Adjoint:
-        """Derivatives of Σ e(k) · y(k)."""
+    def adjoint(
+        self, e: Float[Tensor, "R T ny"], end: Float[Tensor, "R nx"] | None = None
+    ) -> Adjoint:
+        """Derivatives of Σ e(k) · y(k), and of end · x(T) unless a record is periodic."""
         W = self.weights
-        end = self._periodic_costate(e) if self.periodic else self.state
+        end = self._periodic_costate(e) if self.periodic else self.state if end is None else end
         parts, by_u = [], []
         for block in self._blocks(backwards=True):
             e_block = e[:, block.time]

@@ -10,11 +10,16 @@ from torch.autograd import gradcheck
 from torch.nn.utils import parameters_to_vector
 from torch.testing import assert_close
 
+from lfrtorch._support.errors import LfrtorchError
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.records import Start
 
-pytestmark = pytest.mark.numeric
+pytestmark = [
+    pytest.mark.numeric,
+    # torch's own use of it, in its forward mode
+    pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning"),
+]
 
 STARTS: tuple[Start, ...] = ("zero", "periodic")
 
@@ -71,8 +76,11 @@ def test_second_derivatives_are_refused():
     lfr = small()
     loss = lfr(normal(1, 5, 2)).square().sum()
     (gradient,) = torch.autograd.grad(loss, lfr.cell.A, create_graph=True)
-    with pytest.raises(RuntimeError, match="differentiate twice"):
+    with pytest.raises(LfrtorchError, match="first derivatives only; for second ones step its cel"):
         gradient.sum().backward()
+    hessian = torch.func.hessian(lambda u: lfr(u).square().sum())
+    with pytest.raises(LfrtorchError, match="first derivatives only"):
+        hessian(normal(1, 5, 2))
 
 
 @pytest.mark.parametrize("start", STARTS)
