@@ -66,7 +66,7 @@ def planted() -> lfrtorch.Model:
     """A stable model with random weights."""
     torch.manual_seed(SEED)
     static = lfrtorch.Network(2, 1, 15)
-    cell = lfrtorch.LFRCell(1, 1, NX, 2, 1, static).double()
+    cell = lfrtorch.LFRCell(1, 1, NX, 2, 1, static, random=False).double()
     with torch.no_grad():
         for matrix in (cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy):
             matrix.normal_()

@@ -84,7 +84,7 @@ def oscillator() -> lfrtorch.Model:
     """Two states, resonance at a twentieth of the rate, damping 0.1, a spring that softens."""
     angle, radius = 0.3, 0.97
     static = lfrtorch.Network(1, 1, 1, dtype=torch.float64)
-    cell = lfrtorch.LFRCell(1, 1, 2, 1, 1, static, dtype=torch.float64)
+    cell = lfrtorch.LFRCell(1, 1, 2, 1, 1, static, dtype=torch.float64, random=False)
     turn = radius * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     with torch.no_grad():
         cell.A.copy_(torch.as_tensor(turn))

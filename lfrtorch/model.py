@@ -927,7 +927,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         if weights["A"].shape != (sizes["nx"],) * 2:
             raise InputError("they are of other sizes")
         static = _made(made, sizes["nz"], sizes["nw"], dtype, static)
-        cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
+        cell = LFRCell(**sizes, static=static, dtype=dtype, random=False).to(dtype)
         K = weights.pop("K", None)
         for name in [n for n in weights if n.startswith("fixed.")]:
             cell.fix(name.removeprefix("fixed."), weights.pop(name) != 0)

@@ -61,7 +61,7 @@ def model(draw: random.Random) -> lfrtorch.Model:
         own = known(draw, ny).map(nu, ny, 1.0)
         static = DirectSum([own, static], [(own.nz, own.nw), (nz, nw)])
         nx, nz, nw = max(nx, 2), own.nz + nz, own.nw + nw
-    cell = LFRCell(nu, ny, nx, nz, nw, static, dtype=dtype)
+    cell = LFRCell(nu, ny, nx, nz, nw, static, dtype=dtype, random=False)
     generator = torch.Generator().manual_seed(draw.randrange(1 << 30))
     with torch.no_grad():
         for weight in cell.parameters(recurse=False):
@@ -159,14 +159,19 @@ def refused(made: lfrtorch.Model, draw: random.Random) -> None:
 
 def broken(made: lfrtorch.Model) -> LFR:
     """A copy with one weight of another shape, put in by hand."""
-    cell = LFRCell(made.lfr.cell.nu, made.lfr.cell.ny, made.lfr.cell.nx).to(made.lfr.cell.A)
+    cell = LFRCell(made.lfr.cell.nu, made.lfr.cell.ny, made.lfr.cell.nx, random=False).to(
+        made.lfr.cell.A
+    )
     cell.Bu = torch.nn.Parameter(cell.A.new_zeros(cell.nx, cell.nu + 1))
     return LFR(cell)
 
 
 def planted() -> None:
     """A wrong index: an input that has no channel for the kernel's second column."""
-    channel, lfr = (lfrtorch.Channel("a"),), LFR(LFRCell(1, 1, 1, dtype=torch.float64))
+    channel, lfr = (
+        (lfrtorch.Channel("a"),),
+        LFR(LFRCell(1, 1, 1, dtype=torch.float64, random=False)),
+    )
     made = lfrtorch.Model(lfr, lfrtorch.Scaler(*np.ones((4, 1))), 1.0, channel, channel)
     observer = made.observer(noise=NoiseCovariance(1, 1))
     call = observer._call  # pyright: ignore[reportAttributeAccessIssue]

@@ -140,7 +140,7 @@ def random_cell(
     """
     if static is None and nw:
         static = Network(nz, nw, nn, activation)
-    cell = LFRCell(nu, ny, nx, nz, nw, static).to(torch.float64)
+    cell = LFRCell(nu, ny, nx, nz, nw, static, random=False).to(torch.float64)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for p in cell.parameters():

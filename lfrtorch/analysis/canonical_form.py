@@ -160,7 +160,9 @@ def _cell(cell: LFRCell, made: dict[str, Array], slope: Array, into: Array, out:
     parts = (torch.as_tensor(np.ascontiguousarray(part)) for part in (slope, into, out))
     assert cell.static is not None
     static = Beyond(deepcopy(cell.static), *parts)
-    found = LFRCell(cell.nu, cell.ny, cell.nx, cell.nz, cell.nw, static, dtype=torch.float64)
+    found = LFRCell(
+        cell.nu, cell.ny, cell.nx, cell.nz, cell.nw, static, dtype=torch.float64, random=False
+    )
     with torch.no_grad():
         for name, value in made.items():
             found.get_parameter(name).copy_(torch.as_tensor(np.ascontiguousarray(value)))

@@ -99,7 +99,7 @@ def _learned(cell: LFRCell) -> LFRCell:
         return cell
     own, learned = parts
     sizes = cell.nu, cell.ny, cell.nx, cell.nz - own.nz, cell.nw - own.nw
-    return LFRCell(*sizes, learned, dtype=torch.float64)
+    return LFRCell(*sizes, learned, dtype=torch.float64, random=False)
 
 
 def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | None) -> _Visited:

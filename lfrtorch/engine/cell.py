@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -18,6 +19,10 @@ def check_dtype(dtype: torch.dtype) -> None:
     """Refuse any dtype but float32 and float64 with a ValueError."""
     if dtype not in (torch.float32, torch.float64):
         raise InputError(f"dtype is {dtype!r}; give torch.float64 or torch.float32.")
+
+
+_DECAY = 0.9
+"""Magnitude of all eigenvalues of a random A."""
 
 
 class Matrices(NamedTuple):
@@ -41,11 +46,13 @@ class LFRCell(nn.Module):
         w  = static(z)
         y  = Cy x + Dyu u + Dyw w
 
-    All matrices start at zero; ``lfrtorch.initialise`` writes the best linear approximation.
+    The matrices start at random, see ``reset_parameters``; ``lfrtorch.initialise`` writes the best
+    linear approximation, from which a fit takes a hundredth of the iterations.
 
     Args:
         nu, ny, nx, nz, nw: sizes; ``nz = nw = 0`` without ``static`` is a linear model.
         static: the map z -> w: any module from (..., nz) to (..., nw).
+        random: False leaves all matrices at zero, for who fills them.
         device, dtype: of the matrices, as in any torch module.
 
     Shape:
@@ -72,6 +79,7 @@ class LFRCell(nn.Module):
         nw: int = 0,
         static: nn.Module | None = None,
         *,
+        random: bool = True,
         device: torch.device | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
@@ -104,6 +112,27 @@ class LFRCell(nn.Module):
         self.past_outputs = 0
         """Number of last inputs that are measured outputs; their Dzu and Dyu stay 0."""
         self._check_shapes()
+        if random and not self.A.is_meta:
+            self.reset_parameters()
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """A random stable start by torch's generator; the static map keeps its own.
+
+        A turns the states and shrinks them by 0.9 a sample, as ``torch.nn.init.orthogonal_`` finds
+        it; white inputs of unit variance give states, z and outputs of about that. Bw is 0, so that
+        the model is stable whatever the map is; Dyw is not, so all weights have a gradient at once.
+        """
+        for p in self.parameters(recurse=False):
+            p.zero_()
+        torch.nn.init.orthogonal_(self.A, gain=_DECAY)
+        for p, variance in (
+            (self.Bu, (1.0 - _DECAY**2) / self.nu),
+            (self.Cz, 1.0 / self.nx),
+            (self.Cy, 1.0 / self.nx),
+            (self.Dyw, 1.0 / max(1, self.nw)),
+        ):
+            p.normal_(std=math.sqrt(variance))
 
     def fix(self, name: str, entries: Tensor) -> None:
         """Let a fit leave entries of a matrix as they are: ``entries`` is a mask of its shape."""

@@ -40,7 +40,9 @@ def disturbed_cell(cell: LFRCell, E: Float[Array, "n nd"], scaler: Scaler) -> LF
             torch.as_tensor(part / scale[:, None]).to(cell.A)
             for part, scale in ((E[:nu], scaler.u_scale), (E[nu:], scaler.y_scale))
         )
-        found = LFRCell(*sizes, deepcopy(cell.static), device=cell.A.device, dtype=cell.A.dtype)
+        found = LFRCell(
+            *sizes, deepcopy(cell.static), device=cell.A.device, dtype=cell.A.dtype, random=False
+        )
         found.A.copy_(torch.block_diag(cell.A, torch.eye(nd).to(cell.A)))
         found.A[: cell.nx, cell.nx :] = cell.Bu @ Eu
         for name in ("Bu", "Bw"):

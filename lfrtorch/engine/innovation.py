@@ -77,7 +77,7 @@ def _like(cell: LFRCell, nu: int) -> LFRCell:
     """A cell of other inputs, with what both forms share; the static map is a copy."""
     A = cell.A
     sizes = nu, cell.ny, cell.nx, cell.nz, cell.nw
-    found = LFRCell(*sizes, deepcopy(cell.static), device=A.device, dtype=A.dtype)
+    found = LFRCell(*sizes, deepcopy(cell.static), device=A.device, dtype=A.dtype, random=False)
     for name in ("Cz", "Cy", "Dyw", "state_covariance"):
         getattr(found, name).copy_(getattr(cell, name))
     return found

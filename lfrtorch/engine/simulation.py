@@ -194,7 +194,7 @@ def folded(cell: LFRCell) -> LFRCell:
     if not isinstance(beyond, Beyond):
         return cell
     sizes = cell.nu, cell.ny, cell.nx, cell.nz, cell.nw
-    found = LFRCell(*sizes, beyond.base, device=cell.A.device, dtype=cell.A.dtype)
+    found = LFRCell(*sizes, beyond.base, device=cell.A.device, dtype=cell.A.dtype, random=False)
     L, Z, W = beyond.slope, beyond.into, beyond.out
     Cz, Dzu, Bw, Dyw = Z @ cell.Cz, Z @ cell.Dzu, cell.Bw @ W, cell.Dyw @ W
     found.state_covariance.copy_(cell.state_covariance)

@@ -65,7 +65,9 @@ def with_driven_states(
     like = {"dtype": cell.A.dtype, "device": cell.A.device}
     decay = np.exp(-np.concatenate([relaxations, np.repeat(_DAMPING * modes, 2)]))
     nx, states = cell.nx, len(decay)
-    larger = LFRCell(cell.nu, cell.ny, nx + states, cell.nz, cell.nw, deepcopy(cell.static), **like)
+    larger = LFRCell(
+        cell.nu, cell.ny, nx + states, cell.nz, cell.nw, deepcopy(cell.static), **like, random=False
+    )
     for name in ("A", "Bu", "Bw", "Cy", "Cz"):
         entries, own = larger.get_parameter(name).zero_(), cell.get_parameter(name)
         entries[: len(own), : own.shape[1]] = own

@@ -93,7 +93,7 @@ def around(
     if learned is not None:
         whole = DirectSum([static, learned], [(static.nz, static.nw), (nz, nw)])
     sizes = nu, ny, nx + states, static.nz + nz, static.nw + nw
-    cell = LFRCell(*sizes, whole, dtype=static.p.dtype, device=static.p.device)
+    cell = LFRCell(*sizes, whole, dtype=static.p.dtype, device=static.p.device, random=False)
     with torch.no_grad():
         cell.Cz[:nx, :nx], cell.Dzu[nx : nx + nu] = torch.eye(nx), torch.eye(nu)
         cell.Bw[:nx, :nx], cell.Dyw[:, nx : nx + ny] = torch.eye(nx), torch.eye(ny)

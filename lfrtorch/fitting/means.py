@@ -71,7 +71,7 @@ def mean_model(models: Sequence[Model]) -> Model:
     nn = sum(len(network.bz) for network in networks)
     like = {"device": cells[0].A.device, "dtype": cells[0].A.dtype}
     network = Network(nz, nw, nn, networks[0].activation, **like)
-    cell = LFRCell(cells[0].nu, cells[0].ny, nx, nz, nw, network, **like)
+    cell = LFRCell(cells[0].nu, cells[0].ny, nx, nz, nw, network, **like, random=False)
     with torch.no_grad():
         cell.A.copy_(blocks(lambda c: c.A))
         cell.Bw.copy_(blocks(lambda c: c.Bw))

@@ -165,13 +165,16 @@ def initialise(
         assert nn is not None
         with torch.device("meta"):  # nothing is allocated
             planned = Network(nz, nw, nn, activation, dtype=dtype)
-            check_fit_memory(LFRCell(*sizes, nz, nw, planned, dtype=dtype))
+            check_fit_memory(LFRCell(*sizes, nz, nw, planned, dtype=dtype, random=False))
         static = Network(nz, nw, nn, activation, dtype=dtype)
         static.reset_parameters(generator)
     else:
         static = deepcopy(static).to(dtype)
         _check_sizes(static, nz, nw, dtype)
-    linear, cell = LFRCell(*sizes, dtype=dtype), LFRCell(*sizes, nz, nw, static, dtype=dtype)
+    linear, cell = (
+        LFRCell(*sizes, dtype=dtype, random=False),
+        LFRCell(*sizes, nz, nw, static, dtype=dtype, random=False),
+    )
     for target in (linear, cell):
         bla.write(target, scaler)
     response, model = (
@@ -249,7 +252,7 @@ def _in_blocks(cell: LFRCell, structure: str) -> LFRCell:
     if structure in IN_SERIES:
         both, before, none = torch.block_diag(cell.A, cell.A), cell, torch.zeros_like
         sizes = cell.nu, cell.ny, 2 * cell.nx, cell.nz, cell.nw
-        cell = LFRCell(*sizes, before.static, device=both.device, dtype=both.dtype)
+        cell = LFRCell(*sizes, before.static, device=both.device, dtype=both.dtype, random=False)
         cell.A.copy_(both)
         cell.Bu.copy_(torch.cat([before.Bu, none(before.Bu)]))
         cell.Bw.copy_(torch.cat([none(before.Bw), before.Bw]))

@@ -354,7 +354,7 @@ class LinearModel:
         """
         nu, ny = len(self.inputs), len(self.outputs)
         unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
-        cell = LFRCell(nu, ny, self.nx, dtype=torch.float64)
+        cell = LFRCell(nu, ny, self.nx, dtype=torch.float64, random=False)
         self.write(cell, unit)
         K = None if self.K is None else torch.as_tensor(self.K)
         return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs, K=K)
@@ -486,7 +486,7 @@ _SHAPES = {
 
 def linear_cell(A: Array, B: Array, C: Array, D: Array) -> LFRCell:
     """Return a cell without static nonlinearity."""
-    cell = LFRCell(B.shape[1], C.shape[0], len(A), dtype=torch.float64)
+    cell = LFRCell(B.shape[1], C.shape[0], len(A), dtype=torch.float64, random=False)
     with torch.no_grad():
         for parameter, value in ((cell.A, A), (cell.Bu, B), (cell.Cy, C), (cell.Dyu, D)):
             parameter.copy_(torch.as_tensor(np.ascontiguousarray(value)))

@@ -19,7 +19,13 @@ def planted(kind: str) -> Model:
     """Two states before and two after one map, or two branches of these, mixed by a rotation."""
     branches = 2 if kind in ("parallel", "coupled") else 1
     cell = LFRCell(
-        1, 1, 4 * branches, branches, branches, Network(branches, branches, 3 * branches)
+        1,
+        1,
+        4 * branches,
+        branches,
+        branches,
+        Network(branches, branches, 3 * branches),
+        random=False,
     )
     cell.double()
     static = cell.static

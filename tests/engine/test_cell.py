@@ -8,6 +8,7 @@ from torch.nn import Module
 from torch.testing import assert_close
 
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 
 pytestmark = pytest.mark.numeric
@@ -26,7 +27,7 @@ def test_step_is_the_equations():
 
 
 def test_matrices_start_at_zero():
-    cell = LFRCell(2, 3, 4, 2, 1, Network(2, 1, 3))
+    cell = LFRCell(2, 3, 4, 2, 1, Network(2, 1, 3), random=False)
     shapes = {name: tuple(p.shape) for name, p in cell.named_parameters(recurse=False)}
     assert shapes == {
         "A": (4, 4), "Bu": (4, 2), "Bw": (4, 1), "Cz": (2, 4), "Dzu": (2, 2),
@@ -45,7 +46,7 @@ def test_sizes_that_do_not_fit_the_static_map(nz: int, nw: int, static):
 
 
 def test_dtype_is_followed():
-    cell = LFRCell(1, 1, 1, dtype=torch.float64)
+    cell = LFRCell(1, 1, 1, dtype=torch.float64, random=False)
     assert {p.dtype for p in cell.parameters()} == {torch.float64}
     assert "nu=1, ny=1, nx=1, nz=0, nw=0" in repr(cell)
 
@@ -62,3 +63,29 @@ def test_a_static_map_of_other_sizes_is_refused(static: Module, name: str):
 def test_a_step_refuses_signals_of_other_shapes(u: tuple[int, ...], x: tuple[int, ...]):
     with pytest.raises(ValueError, match=r"has the shape .*; give \("):
         random_cell(2, 3, 4, 2, 1, 3)(normal(*u), normal(*x))
+
+
+def test_a_new_cell_is_a_random_stable_model_that_trains():
+    torch.manual_seed(0)
+    cells = [LFRCell(2, 1, 6, 2, 2, Network(2, 2, 5), dtype=torch.float64) for _ in range(2)]
+    assert not torch.equal(cells[0].A, cells[1].A)
+    cell = cells[0].double()
+    assert cell.A.dtype == torch.float64
+    torch.testing.assert_close(
+        torch.linalg.eigvals(cell.A).abs(), torch.full((6,), 0.9, dtype=torch.float64)
+    )
+    lfr, u = LFR(cell), torch.randn(1, 5000, 2, dtype=torch.float64)
+    with torch.no_grad():
+        signals = lfr.trajectory(u)
+        assert 0.5 < signals.x.std() < 2.0
+    # From the first step on there is a gradient for every weight that acts.
+    loss = (lfr(u) - torch.randn(1, 5000, 1, dtype=torch.float64)).square().mean()
+    loss.backward()
+    for name in ("A", "Bu", "Bw", "Cz", "Dzu", "Cy", "Dyu", "Dyw"):
+        gradient = cell.get_parameter(name).grad
+        assert gradient is not None
+        assert gradient.abs().max() > 0, name
+    before = cell.A.detach().clone()
+    cell.reset_parameters()
+    assert not torch.equal(before, cell.A)
+    assert not any(p.any() for p in LFRCell(1, 1, 2, random=False).parameters())

@@ -54,7 +54,9 @@ def cells(method: str) -> list[LFRCell]:
         static, size = known_map(method), 3
         if learned is not None:
             static, size = DirectSum([static, learned.double()], [(3, 3), (2, 1)]), 5
-        cell = LFRCell(1, 1, 3, size, size - (learned is not None), static, dtype=torch.float64)
+        cell = LFRCell(
+            1, 1, 3, size, size - (learned is not None), static, dtype=torch.float64, random=False
+        )
         with torch.no_grad():
             cell.Cz[:2, :2], cell.Dzu[2], cell.Bw[:2, :2], cell.Dyw[0, 2] = (
                 torch.eye(2), 1.0, torch.eye(2), 1.0
@@ -137,7 +139,9 @@ def test_a_centred_hold_is_that_of_the_middle_of_samples():
     steady = 0.5 * (torch.sin(t) - torch.cos(t))
     for centred in (False, True):
         equations = KnownEquations(f, h, ("x",), (), (), 1, "rk4", 1, centred)
-        cell = LFRCell(1, 1, 1, 2, 2, KnownMap(equations, 0.2, dtype=torch.float64)).double()
+        cell = LFRCell(
+            1, 1, 1, 2, 2, KnownMap(equations, 0.2, dtype=torch.float64), random=False
+        ).double()
         with torch.no_grad():
             cell.Cz[0], cell.Dzu[1], cell.Bw[0, 0], cell.Dyw[0, 1] = 1.0, 1.0, 1.0, 1.0
         y = simulation.simulate(cell, u, torch.zeros(1, 1, dtype=torch.float64)).y[0, :, 0]

@@ -130,7 +130,7 @@ def test_linear_cell_is_the_plain_loop():
 def test_own_module_equals_the_compiled_network():
     cell = random_cell(1, 1, 2, 2, 2, 4)
     assert isinstance(cell.static, Network)
-    own = LFRCell(1, 1, 2, 2, 2, SameNetwork(cell.static)).double()
+    own = LFRCell(1, 1, 2, 2, 2, SameNetwork(cell.static), random=False).double()
     own.load_state_dict(cell.state_dict(), strict=False)
     u, x0 = normal(2, 50, 1), normal(2, 2, seed=1)
     assert_same(simulate(own, u, x0), simulate(cell, u, x0), 1e-12)
@@ -141,7 +141,7 @@ def test_own_module_is_followed_step_by_step_where_newton_fails(monkeypatch):
     monkeypatch.setattr("lfrtorch.engine.newton.MAX_NEWTON", 0)
     cell = random_cell(1, 1, 2, 2, 2, 4)
     assert isinstance(cell.static, Network)
-    own = LFRCell(1, 1, 2, 2, 2, SameNetwork(cell.static)).double()
+    own = LFRCell(1, 1, 2, 2, 2, SameNetwork(cell.static), random=False).double()
     own.load_state_dict(cell.state_dict(), strict=False)
     u, x0 = normal(2, 30, 1), normal(2, 2, seed=1)
     expected = simulate(cell, u, x0)
@@ -340,7 +340,7 @@ def test_expanding_but_bounded_trajectory_counts_as_diverged():
     """Its monodromy overflows, and the eigenvalues of infinities crash some builds of LAPACK."""
     # The chaotic Gauss map x+ = exp(-6.2 x²) - 0.5.
     static = Network(1, 1, 1, "rbf", dtype=torch.float64)
-    cell = LFRCell(1, 1, 1, 1, 1, static, dtype=torch.float64)
+    cell = LFRCell(1, 1, 1, 1, 1, static, dtype=torch.float64, random=False)
     with torch.no_grad():
         for weight, value in (
             (cell.Bw, 1.0),

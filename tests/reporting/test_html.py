@@ -311,7 +311,7 @@ def test_a_ratio_of_one_plus_rounding_is_no_gain(single: Run, part: float, said:
 
 
 def test_a_linear_model_alone_is_shown(single: Run):
-    cell = lfrtorch.LFRCell(1, 1, 2, 0, 0, None).double()
+    cell = lfrtorch.LFRCell(1, 1, 2, 0, 0, None, random=False).double()
     single.bla.write(cell, single.result.model.scaler)
     result = replace(single.result, model=replace(single.result.model, lfr=LFR(cell)))
     page = Run(result, single.bla, single.dataset).page()
