@@ -14,6 +14,7 @@ import torch
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.frames import is_frame
 from lfrtorch._support.tables import number, percent, quantity
 from lfrtorch._support.threads import each_alone
 from lfrtorch.analysis.physical_parameters import physical_parameters
@@ -21,6 +22,7 @@ from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network, known_parts
 from lfrtorch.engine.simulation import is_compiled
+from lfrtorch.files.split import cut
 from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.exclusions import allowed
 from lfrtorch.fitting.first_fit import begun_on_part, part_of
@@ -63,6 +65,9 @@ from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import metrics
 from lfrtorch.reporting.verdict import judge, reconsidered
 
+_CUT = 0.2, 0.2
+"""Parts of a record for validation and test."""
+
 _CHOOSING = 20_000
 """Training samples that sizes are chosen with, at most."""
 
@@ -78,7 +83,7 @@ SLOW_SAMPLES = 5000
 
 @typed("dataset")
 def identify(
-    dataset: Dataset,
+    dataset: Dataset | Record | Sequence[Record],
     settings: Settings,
     *,
     observer: Observer | None = None,
@@ -89,7 +94,8 @@ def identify(
     """Identify a nonlinear LFR model, from records to scores.
 
     Args:
-        dataset: records by use.
+        dataset: records by use. One record, or several, are cut in time as a file is: the first
+            0.6 of each for the fit, 0.2 that choose the iterate, and the last 0.2 as a test.
         settings: sizes, starts and trainer.
         observer: who is told of every step. Default: a line on a terminal or in a notebook shows
             how far it is. :class:`lfrtorch.reporting.Console` prints every step,
@@ -122,16 +128,34 @@ def identify(
         >>> score["rmse"] < score["lti_rmse"]
         True
     """
-    if not isinstance(dataset, Dataset):
-        raise InputError(
-            "identify takes a Dataset: lfrtorch.Dataset('mine', train=[...], validation=[...], "
-            f"tests=[...]), and not {type(dataset).__name__}."
-        )
+    dataset = _by_use(dataset)
     ranks = Ranks() if ranks is None else ranks
     if observer is None:
         observer = LineObserver() if ranks.rank == 0 else Observer()
     with closing(observer):
         return _identified(Stage(dataset, settings, observer, ranks, stop), snapshots)
+
+
+def _by_use(given: Any) -> Dataset:
+    """A dataset as it is, or of records each cut in time."""
+    if isinstance(given, Dataset):
+        return given
+    records = [given] if isinstance(given, Record) else given
+    if (
+        not isinstance(records, list | tuple)
+        or not records
+        or not all(isinstance(record, Record) for record in records)
+    ):
+        means = "; lfrtorch.load_records(df, inputs=..., outputs=...) makes one of a frame"
+        raise InputError(
+            "identify takes a Record, or a Dataset('mine', train=[...], validation=[...], "
+            f"tests=[...]), and not {type(given).__name__}{means if is_frame(given) else ''}."
+        )
+    parts = [cut(record, *_CUT) for record in records]
+    found = {use: [part[use] for part in parts] for use in ("train", "validation", "test")}
+    if len(records) == 1:
+        found = {use: [replace(part, name=use) for part in own] for use, own in found.items()}
+    return Dataset(records[0].name, found["train"], found["validation"], found["test"])
 
 
 def _identified(given: Stage, snapshots: Snapshots | None) -> Run:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast, overload
 
 import numpy as np
 import torch
@@ -20,6 +20,8 @@ from lfrtorch._support import checkpoint
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, reals
 from lfrtorch._support.errors import InputError, brief
+from lfrtorch._support.frames import columns_of, framed, index_rate, is_frame
+from lfrtorch._support.headers import names_and_units
 from lfrtorch._support.types import Array
 from lfrtorch.data_reach import Cloud, DataReach
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, fixed_entries
@@ -76,6 +78,10 @@ common sample, in samples."""
 
 _TOGETHER = 1000
 """Predictions that are simulated at once."""
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 
 _SCALING = ("u_offset", "u_scale", "y_offset", "y_scale")  # fields of a Scaler, in a checkpoint
 
@@ -320,14 +326,19 @@ class Model:
             return self.parameter_count - gauge - cell.nw * (terms[1] - terms[0] + nz)
         return self.parameter_count - gauge - len(static.bz) * (cell.nz - nz)
 
-    @typed()
+    @typed("data")
     def simulate(
-        self, data: Record | ArrayLike, *, start: Start | None = None, x0: ArrayLike | None = None
+        self,
+        data: Record | ArrayLike | DataFrame,
+        *,
+        start: Start | None = None,
+        x0: ArrayLike | None = None,
     ) -> Array:
         """Simulated output in physical units.
 
         Args:
-            data: a record, or an input in physical units.
+            data: a record, an input in physical units, or a pandas data frame with columns that are
+                called as the inputs: of it the outputs come as a frame with its index.
             start: ``"zero"`` (x = 0: at rest at the input's offset, up to the network's bias),
                 ``"given"`` (x0), ``"periodic"``, ``"measured"``: from the state that the record's
                 first output tells, or ``"estimated"``: from the most probable state, given the
@@ -347,9 +358,28 @@ class Model:
             >>> model.simulate(np.zeros(50)).shape  # any input, from x = 0
             (50, 1)
         """
-        y = self.signals(data, start=start, x0=x0).y[0].double().numpy()
+        signals = self._inputs_of(data) if is_frame(data) else cast("Record | ArrayLike", data)
+        y = self.signals(signals, start=start, x0=x0).y[0].double().numpy()
         y = self.scaler.restore_y(y)
+        if is_frame(data):
+            return framed(y, [channel.name for channel in self.outputs], data)
         return data.shown(y) if isinstance(data, Record) else y
+
+    def _inputs_of(self, frame: Any) -> Array:
+        """The inputs among the columns of a frame."""
+        index_rate(frame, self.fs)
+        headers = [str(column) for column in frame.columns]
+        named = [name for name, _ in names_and_units(headers, {})]
+        wanted = [channel.name for channel in self.inputs]
+        missing = [name for name in wanted if name not in (*named, *headers)]
+        if missing:
+            raise InputError(
+                f"the frame has no column {', '.join(map(repr, missing))}, an input of the model; "
+                f"it has {headers}."
+            )
+        return columns_of(
+            frame, [(named if name in named else headers).index(name) for name in wanted]
+        )
 
     def signals(
         self, data: Record | ArrayLike, *, start: Start | None = None, x0: ArrayLike | None = None

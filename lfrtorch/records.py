@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch._support.checks import integer, number, reals
 from lfrtorch._support.errors import InputError, brief
+from lfrtorch._support.frames import columns_of, index_rate, is_frame
+from lfrtorch._support.headers import names_and_units
 from lfrtorch._support.types import Array, Booleans
 
 Start = Literal["zero", "given", "estimated", "periodic", "measured"]
@@ -157,6 +159,56 @@ class Record:
         for field, value in (("u", u), ("y", y), ("inputs", inputs), ("outputs", outputs)):
             object.__setattr__(self, field, value)
         self._check_valid()
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: Any,
+        inputs: str | Sequence[str],
+        outputs: str | Sequence[str],
+        fs: float | None = None,
+        **options: Any,
+    ) -> Record:
+        """A record of columns of a pandas data frame; outputs without a value are not valid.
+
+        Args:
+            frame: rows are samples.
+            inputs, outputs: one or several columns by name; a unit may stand behind it, "force (N)"
+                is also called "force".
+            fs: sampling frequency in Hz. Default: from an index of date-times, time differences or
+                seconds.
+            options: other arguments of a record.
+
+        Raises:
+            ValueError: a column that is not there or has no numbers, inputs without a value, or an
+                index that is no even time.
+
+        Example:
+            >>> import pandas as pd
+            >>> frame = pd.DataFrame({"force (N)": record.u[:, 0], "disp": record.y[:, 0]})
+            >>> lfrtorch.Record.from_frame(frame, "force", "disp", fs=100.0)
+            Record('record': force (N) -> disp, 400 samples at 100 Hz, start zero)
+        """
+        if not is_frame(frame):
+            raise InputError(f"frame is {brief(repr(frame))}; give a pandas DataFrame.")
+        headers = [str(column) for column in frame.columns]
+        channels = [Channel(*each) for each in names_and_units(headers, {})]
+        called = {name: i for i, name in enumerate(headers)}
+        called = {channel.name: i for i, channel in enumerate(channels)} | called
+        sides = []
+        for side, names in (("inputs", inputs), ("outputs", outputs)):
+            listed = [names] if isinstance(names, str) else list(names)
+            missing = [name for name in listed if name not in called]
+            if missing or not listed:
+                raise InputError(
+                    f"{side} is {names!r}; give names of columns of the frame: {headers}."
+                )
+            sides.append([called[name] for name in listed])
+        u, y = (columns_of(frame, side) for side in sides)
+        named = (tuple(channels[i] for i in side) for side in sides)
+        valid = None if np.isfinite(y).all() else np.isfinite(y)
+        given = {**dict(zip(("inputs", "outputs"), named, strict=True)), "valid": valid, **options}
+        return cls(u, y, index_rate(frame, fs), **given)
 
     def _measured(self) -> ArrayLike:
         """The output, interpolated where it is not valid."""

@@ -472,9 +472,9 @@ def test_settings_know_what_is_searched():
     assert settings(seed=7, starts=3).seeds == (7, 1007, 2007)
 
 
-def test_records_alone_are_no_dataset(dataset: Dataset):
-    with pytest.raises(ValueError, match=r"takes a Dataset: lfrtorch\.Dataset\('mine', train="):
-        identify(dataset.train, settings())  # pyright: ignore[reportArgumentType]
+def test_arrays_alone_are_no_dataset(dataset: Dataset):
+    with pytest.raises(ValueError, match=r"takes a Record, or a Dataset\('mine', train="):
+        identify(dataset.train[0].u, settings())  # pyright: ignore[reportArgumentType]
 
 
 def test_a_dataset_takes_a_single_record_and_nothing_else_than_records():

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import takewhile
 from numbers import Real
 from pathlib import Path
-from typing import Any, Literal, TypeGuard, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeGuard, cast
 
 from numpy.typing import ArrayLike
 
@@ -20,6 +20,7 @@ from lfrtorch._support.paths import expanded, real
 from lfrtorch.dataset import Dataset
 from lfrtorch.files.excel import workbook
 from lfrtorch.files.formats import similar
+from lfrtorch.files.frame import frame_tables
 from lfrtorch.files.measurement import (
     Gaps,
     Measurement,
@@ -28,12 +29,15 @@ from lfrtorch.files.measurement import (
     read_measurement,
 )
 from lfrtorch.files.split import TooShortError, cut
-from lfrtorch.files.table import Columns, NoColumnError
+from lfrtorch.files.table import Columns, NoColumnError, Table
 from lfrtorch.linear.record_start import try_starts
 from lfrtorch.periods import find_period, find_transient
 from lfrtorch.records import Record
 from lfrtorch.score_window import SHORTEST, warm_up
 from lfrtorch.survey.integration import integrators
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 __all__ = ["load_records"]
 
@@ -65,7 +69,7 @@ class _Whole:
 
 @typed("path", "inputs", "outputs", "reference")
 def load_records(
-    path: Paths,
+    path: Paths | DataFrame | Sequence[DataFrame],
     *,
     inputs: Columns | None = None,
     outputs: Columns | None = None,
@@ -91,7 +95,8 @@ def load_records(
 
     Args:
         path: a file, a pattern as ``"runs/*.csv"``, or a list of these; ``"rig.xlsx#Run 2"`` is a
-            sheet of a workbook. Default: its first that has samples.
+            sheet of a workbook. Default: its first that has samples. Or a pandas data frame, or a
+            list of them, with an index of times or ``fs``.
         inputs: one or several names of columns or arrays, or column numbers from 0. An array of
             several channels is several inputs, and ``"acc[0]"`` is the first channel of ``acc``.
             Default: those whose names leave no doubt, as ``u``, or ``u1`` and ``u2``.
@@ -155,11 +160,12 @@ def load_records(
         validation=validation if _is_fraction(validation) else 0.0,
         test=test if _is_fraction(test) else 0.0,
     )
-    paths = listed_files(path, "path")
-    left = reader.read(paths)
+    sources = frame_tables(path) or listed_files(path, "path")
+    name = _name([place_of(source) for source in sources])
+    left = reader.read(sources)
     if test == EVERYTHING:
         tests = [whole.record for whole in left]
-        return Dataset(_name(paths), [], [], tests, notes=reader.notes)
+        return Dataset(name, [], [], tests, notes=reader.notes)
     tests, left, tested = _taken("test", test, left, reader)
     chosen, left, validated = _taken("validation", validation, left, reader)
     if not left:
@@ -197,9 +203,7 @@ def load_records(
     for use, records in parts.items():
         if len(records) == 1:
             parts[use] = [replace(records[0], name=use)]
-    return Dataset(
-        _name(paths), parts["train"], parts["validation"], parts["test"], notes=reader.notes
-    )
+    return Dataset(name, parts["train"], parts["validation"], parts["test"], notes=reader.notes)
 
 
 class _Reader:
@@ -241,12 +245,13 @@ class _Reader:
             for text, names in self._notes.items()
         )
 
-    def read(self, paths: Sequence[Path]) -> list[_Whole]:
-        """The records of some files."""
+    def read(self, sources: Sequence[Path | Table]) -> list[_Whole]:
+        """The records of some files or frames."""
         found = []
+        paths = [place_of(source) for source in sources]
         stems = _stems(paths, {whole.stem for whole in self.all})
-        for path, stem in zip(paths, stems, strict=True):
-            measured = self._measured(path)
+        for source, path, stem in zip(sources, paths, stems, strict=True):
+            measured = self._measured(source)
             several = len(measured.stretches) > 1
             self.note(stem, *measured.notes)
             if several:
@@ -295,10 +300,11 @@ class _Reader:
             for record in records
         ]
 
-    def _measured(self, path: Path) -> Measurement:
+    def _measured(self, source: Path | Table) -> Measurement:
         """What a file measured, checked to be of a kind with the first."""
+        path = place_of(source)
         try:
-            measured = read_measurement(path, self.wanted)
+            measured = read_measurement(source, self.wanted)
         except NoColumnError as error:
             if self._first is None:
                 raise
@@ -426,6 +432,11 @@ def listed_files(given: Any, option: str) -> list[Path]:
             raise FileNotFoundError(f"no file matches '{path}'{similar(path)}.")
         found += sorted(matches, key=lambda p: _counting(str(p)))
     return list({real(path): path for path in found}.values())
+
+
+def place_of(source: Path | Table) -> Path:
+    """Where it is, or how it is called."""
+    return source.path if isinstance(source, Table) else source
 
 
 def _counting(text: str) -> list[tuple[int, str]]:

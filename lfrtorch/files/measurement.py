@@ -64,9 +64,10 @@ class Measurement:
     notes: list[str]
 
 
-def read_measurement(path: Path, wanted: Wanted) -> Measurement:
+def read_measurement(source: Path | Table, wanted: Wanted) -> Measurement:
     """Read inputs, outputs and sampling frequency of a file; refuse gaps, unless to be split."""
-    table = open_table(path)
+    table = source if isinstance(source, Table) else open_table(source)
+    path = table.path
     inputs, outputs, told = table.by_name(wanted.inputs, wanted.outputs)
     u = table.find(inputs, "inputs")
     y = table.find(outputs, "outputs")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import re
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfrtorch._support.errors import InputError, brief
+from lfrtorch._support.headers import names_and_units
 from lfrtorch._support.memory import check_memory
 from lfrtorch._support.types import Array
 from lfrtorch.records import Channel
@@ -27,11 +27,6 @@ BLOCK = 65536
 LEAST = 10
 """Samples that tell a header of numbers above them, and words below, and rows of words at most."""
 
-_SCALED = "m|g|s|A|K|mol|cd|Hz|N|Nm|Pa|J|W|VA|V|F|Ω|[Oo]hm|T|H|Wb|S|rad|bar|l|L|eV|C|B"
-_OTHER = "min|h|d|sec|deg|°|°C|°F|deg[CF]|%|rpm|rev|psi|lbf?|in|ft|dB|px|counts?|a\\.u\\.|-|1"
-_ATOM = rf"(?:(?:da|[TGMkhdcmuµμnpf])?(?:{_SCALED})|{_OTHER})(?:\^?-?[0-9²³⁻¹]+)?"
-_UNIT = re.compile(rf"{_ATOM}(?:[/*·. ]{_ATOM})*")
-_BRACKETS = re.compile(r"(.*)[(\[]([^()\[\]]*)[)\]]")
 _CHANNEL = re.compile(r"(.+)\[(\d+)\]")
 _SIDES = {
     "inputs": re.compile(r"(u|uest|in|input)_?(\d*)", re.IGNORECASE),
@@ -86,7 +81,9 @@ class Table(ABC):
         self.headers = tuple(headers)
         self.columns = tuple(
             channel._replace(unit="s") if i in clocks else channel
-            for i, channel in enumerate(channels(headers, units or {}))
+            for i, channel in enumerate(
+                Channel(*each) for each in names_and_units(headers, units or {})
+            )
         )
         self.arrays = dict(arrays or {})
         self.refused = dict(refused or {})
@@ -241,50 +238,6 @@ class Table(ABC):
         names = [brief(repr(column.name), _NAME) for column in self.columns[:_ALL]]
         shown = names if count <= _ALL else [*names[:_SOME], "..."]
         return f"{count} column(s): {', '.join(shown)}"
-
-
-def is_unit(text: str) -> bool:
-    """Whether it is written as a unit, as N, mm or m/s^2."""
-    return _UNIT.fullmatch(text) is not None
-
-
-def bracketed(text: str) -> str | None:
-    """What stands in brackets, if that is all."""
-    name, inside = _parts(text)
-    return inside if inside and not name.strip() else None
-
-
-def _parts(header: str) -> tuple[str, str]:
-    """What stands before the brackets at its end and in them; empty if nothing is that short."""
-    found = _BRACKETS.fullmatch(header)
-    inside = found[2].strip() if found else ""
-    return (found[1], inside) if found and 0 < len(inside) <= 16 else (header, "")
-
-
-def channels(headers: Sequence[str], units: Mapping[str, str]) -> tuple[Channel, ...]:
-    """Split headers as "force (N)", "force [N]" or "force/N" into names and units."""
-    # Brackets stay in the name if names would be equal without them, or if they follow the name
-    # at once and hold no unit, as in "y(t)".
-    found = [
-        Channel(header, units[header]) if units.get(header) else _channel(header)
-        for header in headers
-    ]
-    count = Counter(channel.name for channel in found)
-    return tuple(
-        channel if count[channel.name] == 1 else Channel(header, units.get(header, ""))
-        for header, channel in zip(headers, found, strict=True)
-    )
-
-
-def _channel(header: str) -> Channel:
-    before, inside = _parts(header)
-    name = before.rstrip()
-    if inside and name and (name != before or is_unit(inside)):
-        return Channel(name, inside)
-    name, slash, unit = header.partition("/")
-    if slash and name.strip() and is_unit(unit.strip()):
-        return Channel(name.strip(), unit.strip())
-    return Channel(header)
 
 
 class Clock:

@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfrtorch._support.errors import InputError, brief
+from lfrtorch._support.headers import bracketed, is_unit
 from lfrtorch._support.types import Array
-from lfrtorch.files.table import BLOCK, LEAST, Clock, Table, bracketed, is_unit
+from lfrtorch.files.table import BLOCK, LEAST, Clock, Table
 
 _HEAD = 1 << 18  # characters that tell the layout
 _LONGEST = 1 << 25  # characters of a line

@@ -73,6 +73,17 @@ class Settings(PlainSettings):
     )
     dtype: torch.dtype = setting(torch.float64, "of the fit: float64 or float32.")
 
+    def __new__(cls, *_: Any, **given: Any) -> Settings:
+        """Refuse what is the trainer's, and say where it goes."""
+        options, own = (signature(kind).parameters for kind in (LevenbergMarquardt, cls))
+        for name, value in given.items():
+            if name in options and name not in own:
+                raise InputError(
+                    f"{name} is an option of the trainer: give "
+                    f"trainer=lfrtorch.LevenbergMarquardt({name}={value!r})."
+                )
+        return super().__new__(cls)
+
     def __post_init__(self) -> None:
         if not isinstance(self.init_from, Model | None):
             raise InputError(

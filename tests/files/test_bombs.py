@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lfrtorch._support.headers import names_and_units
 from lfrtorch.files.load import load_records
-from lfrtorch.files.table import channels
 from lfrtorch.files.text import _LONGEST
 
 
@@ -60,5 +60,5 @@ def test_a_part_of_a_workbook_that_no_program_packs(tmp_path: Path):
 
 
 def test_names_of_many_columns_are_told_apart():
-    found = channels(["a (N)", "a (V)", *map(str, range(20_000))], {})
-    assert [found[0].name, found[1].name, len(found)] == ["a (N)", "a (V)", 20_002]
+    found = names_and_units(["a (N)", "a (V)", *map(str, range(20_000))], {})
+    assert [found[0][0], found[1][0], len(found)] == ["a (N)", "a (V)", 20_002]
