@@ -16,6 +16,7 @@ from typing import Any
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.memory import in_bytes
 from lfrtorch.files.arrays import optional
+from lfrtorch.files.loggers import READERS
 from lfrtorch.files.text import Layout, Line, TextTable, layout_of, with_point
 
 _HEAD = 1000
@@ -36,10 +37,10 @@ EXTENSIONS = (".xlsx", ".xlsm")
 
 
 def workbook(path: Path) -> tuple[Path, str]:
-    """The file of a path and the sheet behind it, ``rig.xlsx#Run 2``, empty if none."""
+    """The file of a path and what stands behind it, ``rig.xlsx#Run 2``, empty if nothing."""
     name, mark, sheet = str(path).rpartition("#")
     file = Path(name)
-    named = mark and file.suffix.lower() in EXTENSIONS and not path.is_file()
+    named = mark and file.suffix.lower() in (*EXTENSIONS, *READERS) and not path.is_file()
     return (file, sheet) if named else (path, "")
 
 

@@ -10,6 +10,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import expanded
 from lfrtorch.files import arrays as array_table
 from lfrtorch.files.excel import EXTENSIONS, ExcelTable, workbook
+from lfrtorch.files.loggers import READERS
 from lfrtorch.files.parquet import ParquetTable
 from lfrtorch.files.table import BLOCK, Table
 from lfrtorch.files.text import TextTable
@@ -24,6 +25,7 @@ FORMATS: dict[str, Callable[[Path], Table]] = {
     **dict.fromkeys((".h5", ".hdf5"), array_table.hdf5),
     ".parquet": ParquetTable,
     **dict.fromkeys(EXTENSIONS, ExcelTable),
+    **READERS,
 }
 """How a file is read, by its extension; a text file may be compressed (.csv.gz)."""
 
@@ -31,14 +33,11 @@ _SHOWN = 8
 _INSTEAD = {
     ".xls": "save it as .xlsx",
     ".ods": "save it as .xlsx",
-    ".tdms": "export it as text or convert it to HDF5",
-    ".mdf": "export it as text, MATLAB or Parquet",
-    ".mf4": "export it as text, MATLAB or Parquet",
 }
 
 
 def open_table(path: str | Path) -> Table:
-    """Open the table of a file, or of the sheet behind its name: ``rig.xlsx#Run 2``."""
+    """Open the table of a file, of the sheet behind its name, ``rig.xlsx#Run 2``, or at a rate."""
     path = expanded(path)
     if path.is_dir():
         inside = sorted(p.name for p in path.iterdir() if extension(p) in FORMATS)

@@ -1,0 +1,190 @@
+"""Files of loggers, each by its format's own library: MDF4, TDMS, MCAP, ROS 2 bags, UFF58."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from numbers import Real
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfrtorch._support.errors import InputError, brief
+from lfrtorch.files.arrays import optional
+from lfrtorch.files.series import Series, SeriesTable
+from lfrtorch.files.table import Table
+
+_LONGEST = 16
+"""Entries of an array in a message that are channels."""
+
+_NANOSECONDS = 1e-9
+
+Read = Callable[[Path], Mapping[str, Series]]
+
+
+def _reader(read: Read, kind: str) -> Callable[[Path], Table]:
+    """What opens a file, with one message for all ways in which it may be damaged."""
+
+    def opened(path: Path) -> Table:
+        file = Path(str(path).rpartition("#")[0]) if not path.is_file() else path
+        try:
+            found = read(file)
+        except InputError:
+            raise
+        except Exception as error:  # each library has errors of its own
+            raise InputError(
+                f"'{file}' is not a readable {kind} file ({brief(repr(error))}); write it again."
+            ) from error
+        return SeriesTable(path, file, found)
+
+    return opened
+
+
+def _mdf(path: Path) -> dict[str, Series]:
+    """The channels of an MDF file; one that is called as one before it has its group's number."""
+    asammdf = optional("asammdf")
+    found: dict[str, Series] = {}
+    with asammdf.MDF(str(path)) as file:
+        for number, signal in enumerate(file.iter_channels()):
+            if signal.samples.dtype.kind in "biuf" and signal.samples.ndim == 1:
+                own = signal.name if signal.name not in found else f"{signal.name} [{number}]"
+                found[own] = Series(signal.timestamps, signal.samples, signal.unit or "")
+    return found
+
+
+def _tdms(path: Path) -> dict[str, Series]:
+    """The channels of all groups, by name, or by group and name if that is not one."""
+    nptdms = optional("nptdms")
+    found: dict[str, Series] = {}
+    begins: dict[str, int] = {}
+    with nptdms.TdmsFile.read(str(path)) as file:
+        channels = [channel for group in file.groups() for channel in group.channels()]
+        names = [channel.name for channel in channels]
+        for channel in channels:
+            if channel.dtype.kind not in "biuf" or not len(channel):
+                continue
+            twice = names.count(channel.name) > 1
+            name = f"{channel.group_name}/{channel.name}" if twice else channel.name
+            told = channel.properties
+            if "wf_increment" not in told:
+                raise InputError(
+                    f"'{path}': the channel {name!r} has no wf_increment, so its times are not "
+                    "known; export it as text, and give fs."
+                )
+            t = told.get("wf_start_offset", 0.0) + told["wf_increment"] * np.arange(len(channel))
+            begins[name] = int(np.datetime64(told.get("wf_start_time", 0), "us").astype(np.int64))
+            unit = str(told.get("unit_string", ""))
+            found[name] = Series(t, channel[:].astype(np.float64), unit)
+    first = min(begins.values(), default=0)  # seconds since 1970 would lose digits
+    return {
+        name: series._replace(t=series.t + 1e-6 * (begins[name] - first))
+        for name, series in found.items()
+    }
+
+
+def _uff(path: Path) -> dict[str, Series]:
+    """The functions of data sets 58 over time, by their labels or nodes."""
+    pyuff = optional("pyuff")
+    sets = pyuff.UFF(str(path))
+    found: dict[str, Series] = {}
+    kinds = sets.get_set_types()
+    for number in (i for i, kind in enumerate(kinds) if kind == 58):
+        one = sets.read_sets(number)
+        if one["func_type"] not in (0, 1) or np.iscomplexobj(one["data"]):
+            continue  # spectra and responses
+        label = one["id1"].strip()
+        name = label if label not in ("", "NONE") else f"{one['rsp_node']}:{one['rsp_dir']}"
+        name = name if name not in found else f"{name} [{number}]"
+        unit = str(one.get("ordinate_axis_units_lab", "")).strip()
+        found[name] = Series(
+            np.asarray(one["x"]), np.asarray(one["data"]), "" if unit == "NONE" else unit
+        )
+    return found
+
+
+def _mcap(path: Path) -> dict[str, Series]:
+    """Fields of messages in JSON or of ROS 2, by topic and name, at the times of their logging."""
+    reader = optional("mcap.reader")
+
+    def messages() -> Iterator[tuple[str, int, Any]]:
+        stores: dict[int, Callable[[bytes], Any]] = {}
+        with path.open("rb") as file:
+            for schema, channel, message in reader.make_reader(file).iter_messages():
+                if channel.id not in stores:
+                    stores[channel.id] = _decoder(schema, channel.message_encoding)
+                yield channel.topic, message.log_time, stores[channel.id](message.data)
+
+    return _fields(messages())
+
+
+def _decoder(schema: Any, encoding: str) -> Callable[[bytes], Any]:
+    """What turns the bytes of a message into fields."""
+    if encoding == "json":
+        return json.loads
+    if encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
+        typesys = optional("rosbags.typesys")
+        store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        known = typesys.get_types_from_msg(schema.data.decode(), schema.name)
+        store.register({name: one for name, one in known.items() if name not in store.types})
+        return lambda data: store.deserialize_cdr(data, schema.name)
+    return lambda data: None  # a topic in another encoding has no channels
+
+
+def _bag(path: Path) -> dict[str, Series]:
+    """The same of a bag of ROS 2 in sqlite: its folder has metadata.yaml."""
+    rosbag2, typesys = optional("rosbags.rosbag2"), optional("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
+    def messages() -> Iterator[tuple[str, int, Any]]:
+        with rosbag2.Reader(path.parent) as bag:
+            for connection in bag.connections:
+                if connection.msgtype not in store.types and connection.msgdef.data:
+                    known = typesys.get_types_from_msg(connection.msgdef.data, connection.msgtype)
+                    store.register({n: one for n, one in known.items() if n not in store.types})
+            for connection, time, data in bag.messages():
+                yield connection.topic, time, store.deserialize_cdr(data, connection.msgtype)
+
+    return _fields(messages())
+
+
+def _fields(messages: Iterable[tuple[str, int, Any]]) -> dict[str, Series]:
+    """The numbers of messages as channels; seconds count from the first message."""
+    columns: dict[str, tuple[list[int], list[float]]] = {}
+    for topic, time, message in messages:
+        for name, value in _numbers(message, topic.strip("/")):
+            times, values = columns.setdefault(name, ([], []))
+            times.append(time)
+            values.append(value)
+    first = min((times[0] for times, _ in columns.values()), default=0)
+    return {
+        name: Series((np.array(times) - first) * _NANOSECONDS, np.array(values))
+        for name, (times, values) in columns.items()
+    }
+
+
+def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
+    """The numbers in a message with their names, as ``imu.linear_acceleration.x``."""
+    if isinstance(value, Real):
+        yield name, float(value)
+    elif isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _numbers(inner, f"{name}.{key}")
+    elif is_dataclass(value):
+        for field in fields(value):
+            if field.name not in ("header", "__msgtype__"):
+                yield from _numbers(getattr(value, field.name), f"{name}.{field.name}")
+    elif isinstance(value, list | tuple | np.ndarray) and len(value) <= _LONGEST:
+        for i, inner in enumerate(value):
+            yield from _numbers(inner, f"{name}[{i}]")
+
+
+READERS: dict[str, Callable[[Path], Table]] = {
+    **dict.fromkeys((".mf4", ".mdf"), _reader(_mdf, "MDF")),
+    ".tdms": _reader(_tdms, "TDMS"),
+    ".mcap": _reader(_mcap, "MCAP"),
+    ".db3": _reader(_bag, "ROS 2 bag"),
+    **dict.fromkeys((".uff", ".unv"), _reader(_uff, "UFF")),
+}
+"""How a file is read, by its extension; ``#50Hz`` behind it puts all channels on one clock."""

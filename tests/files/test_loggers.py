@@ -1,0 +1,193 @@
+"""Files of loggers, each written by the library that reads it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lfrtorch import InputError, load_records
+from lfrtorch.files.formats import open_table
+from lfrtorch.files.series import Series, SeriesTable
+
+asammdf = pytest.importorskip("asammdf", reason="lfrtorch[files] is not installed")
+mcap_writer = pytest.importorskip("mcap.writer")
+nptdms = pytest.importorskip("nptdms")
+pyuff = pytest.importorskip("pyuff")
+rosbag2 = pytest.importorskip("rosbags.rosbag2")
+typesys = pytest.importorskip("rosbags.typesys")
+
+# pyuff leaves its files to the collector.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+T, FS = 600, 100.0
+TIMES = np.arange(T) / FS
+U = np.random.default_rng(0).normal(size=T)
+Y = np.convolve(U, [0.0, 0.5, 0.3])[:T]
+
+
+def mdf(path: Path) -> None:
+    with asammdf.MDF(version="4.10") as file:
+        signals = [
+            asammdf.Signal(U, TIMES, name="Torque", unit="Nm"),
+            asammdf.Signal(Y, TIMES, name="Speed", unit="rad/s"),
+        ]
+        file.append(signals)
+        slow = asammdf.Signal(Y[::10], TIMES[::10], name="Temperature", unit="°C")
+        file.append([slow])
+        file.save(path, overwrite=True)
+
+
+def tdms(path: Path) -> None:
+    channels = []
+    for name, values, unit in (("Torque", U, "Nm"), ("Speed", Y, "rad/s")):
+        options: dict[str, Any] = {
+            "wf_increment": 1 / FS, "wf_samples": T, "unit_string": unit,
+            "wf_start_time": np.datetime64("2026-01-05T08:00:00", "us"),
+        }  # fmt: skip
+        channels.append(nptdms.ChannelObject("rig", name, values, properties=options))
+    slow = {"wf_increment": 10 / FS, "wf_start_time": np.datetime64("2026-01-05T08:00:00", "us")}
+    channels.append(nptdms.ChannelObject("slow", "Temperature", Y[::10], properties=slow))
+    with nptdms.TdmsWriter(str(path)) as writer:
+        writer.write_segment(channels)
+
+
+def uff(path: Path) -> None:
+    file = pyuff.UFF(str(path))
+    for i, (name, t, values, unit) in enumerate(
+        (("Torque", TIMES, U, "Nm"), ("Speed", TIMES, Y, "rad/s"),
+         ("Temperature", TIMES[::10], Y[::10], "degC"))
+    ):  # fmt: skip
+        unused = {
+            f"{axis}_{what}": 0
+            for axis in ("abscissa", "ordinate", "orddenom", "z_axis")
+            for what in ("spec_data_type", "len_unit_exp", "force_unit_exp", "temp_unit_exp")
+        }
+        labels = {"orddenom_axis_units_lab": "NONE", "z_axis_axis_units_lab": "NONE"}
+        one = pyuff.prepare_58(
+            **unused, **labels, binary=0, func_type=1, ver_num=0, load_case_id=0,
+            rsp_node=i + 1, rsp_dir=1, ref_dir=0, ref_node=0, data=values, x=t, id1=name,
+            id2="NONE", id3="NONE", id4="NONE", id5="NONE", rsp_ent_name="NONE",
+            ref_ent_name="NONE", abscissa_spacing=1, abscissa_min=0.0, abscissa_inc=float(t[1]),
+            z_axis_value=0.0, ordinate_axis_units_lab=unit, abscissa_axis_units_lab="s",
+        )  # fmt: skip
+        file.write_sets(one, "add" if i else "overwrite")
+
+
+def mcap(path: Path) -> None:
+    """Topics in JSON, as Foxglove records them, each with instants of its own."""
+    jitter = np.random.default_rng(1).uniform(-0.5e-3, 0.5e-3, size=T)
+    with path.open("wb") as file:
+        writer = mcap_writer.Writer(file)
+        writer.start()
+        schema = writer.register_schema("any", "jsonschema", b"{}")
+        topics = [writer.register_channel(f"/rig/{name}", "json", schema) for name in "abc"]
+        for k, t in enumerate(TIMES + jitter):
+            for topic, message, late in (
+                (0, {"Torque": U[k], "note": "x"}, 0.0),
+                (1, {"state": {"Speed": Y[k]}}, 1e-6),
+                (2, {"Temperature": Y[k]}, 0.0),
+            ):
+                if topic < 2 or k % 10 == 0:
+                    stamp = 1_700_000_000_000_000_000 + int((t + late) * 1e9)
+                    data = json.dumps(message).encode()
+                    writer.add_message(topics[topic], stamp, data, stamp)
+        writer.finish()
+
+
+def bag(folder: Path, plugin: Any) -> None:
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    Wrench, Vector3 = (store.types[f"geometry_msgs/msg/{n}"] for n in ("Wrench", "Vector3"))
+    Float64 = store.types["std_msgs/msg/Float64"]
+    with rosbag2.Writer(folder, version=9, storage_plugin=plugin) as writer:
+        force, speed = (
+            writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in (("/cmd", Wrench.__msgtype__), ("/speed", Float64.__msgtype__))
+        )
+        zero = Vector3(0.0, 0.0, 0.0)
+        for k, t in enumerate(TIMES):
+            stamp = 1_700_000_000_000_000_000 + round(t * 1e9)
+            wrench = Wrench(zero, Vector3(0.0, 0.0, U[k]))
+            writer.write(force, stamp, store.serialize_cdr(wrench, wrench.__msgtype__))
+            writer.write(speed, stamp, store.serialize_cdr(Float64(Y[k]), Float64.__msgtype__))
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "inputs", "outputs"),
+    [
+        ("a.mf4", mdf, "Torque", "Speed"),
+        ("a.tdms", tdms, "Torque", "Speed"),
+        ("a.uff", uff, "Torque", "Speed"),
+    ],
+)
+def test_channels_by_name_at_their_rate(
+    tmp_path: Path, name: str, write: Callable[[Path], None], inputs: str, outputs: str
+):
+    path = tmp_path / name
+    write(path)
+    data = load_records(path, inputs=inputs, outputs=outputs, start="zero", test="all")
+    record = data.tests[0]
+    assert record.fs == pytest.approx(FS)
+    assert [str(c) for c in (*record.inputs, *record.outputs)] == ["Torque (Nm)", "Speed (rad/s)"]
+    np.testing.assert_allclose(record.u[:, 0], U, atol=1e-9)  # text of 12 digits
+    np.testing.assert_allclose(record.y[:, 0], Y, atol=1e-9)
+    with pytest.raises(InputError, match=rf"for one clock write '{name}#10Hz'"):
+        load_records(path, inputs="Torque", outputs="Temperature")
+    slow = load_records(
+        f"{path}#10Hz", inputs="Torque", outputs=["Speed", "Temperature"], start="zero", test="all"
+    ).tests[0]
+    assert (slow.fs, slow.samples, slow.name) == (pytest.approx(10.0), 60, path.stem + "_10Hz")
+    np.testing.assert_allclose(slow.y[:, 0], slow.y[:, 1], atol=1e-8)
+    with pytest.raises(InputError, match="'#fast' behind the file is no rate"):
+        load_records(f"{path}#fast", inputs="Torque", outputs="Speed")
+
+
+def test_messages_in_json_are_put_on_one_clock(tmp_path: Path):
+    mcap(tmp_path / "a.mcap")
+    inputs, outputs = "rig/a.Torque", "rig/b.state.Speed"
+    data = load_records(
+        tmp_path / "a.mcap", inputs=inputs, outputs=outputs, start="zero", test="all"
+    )
+    record = data.tests[0]
+    assert record.fs == pytest.approx(FS, rel=1e-3)
+    assert any("interpolated to even times" in note for note in data.notes)
+    np.testing.assert_allclose(record.u[:, 0], U[: record.samples], atol=0.4)  # moved by jitter
+    with pytest.raises(InputError, match="#10Hz"):
+        load_records(tmp_path / "a.mcap", inputs="rig/a.Torque", outputs="rig/c.Temperature")
+
+
+@pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
+def test_bags_of_ros_2(tmp_path: Path, plugin: str):
+    bag(tmp_path / "bag", rosbag2.StoragePlugin[plugin])
+    (path,) = [p for p in (tmp_path / "bag").iterdir() if p.suffix in (".db3", ".mcap")]
+    data = load_records(path, inputs="cmd.torque.z", outputs="speed.data", test="all")
+    np.testing.assert_array_equal(data.tests[0].u[:, 0], U)
+    np.testing.assert_array_equal(data.tests[0].y[:, 0], Y)
+    assert data.tests[0].fs == pytest.approx(FS)
+
+
+@pytest.mark.parametrize("name", ["a.mf4", "a.tdms", "a.mcap", "a.uff", "a.db3"])
+def test_damaged_files_and_missing_packages(tmp_path: Path, monkeypatch, name: str):
+    (tmp_path / name).write_bytes(b"nothing of the kind" * 40)
+    with pytest.raises(InputError, match=r"is not a readable|no channel of two samples"):
+        open_table(tmp_path / name)
+    package = {"a.mf4": "asammdf", "a.tdms": "nptdms", "a.mcap": "mcap.reader", "a.uff": "pyuff"}
+    monkeypatch.setitem(sys.modules, package.get(name, "rosbags.rosbag2"), None)
+    with pytest.raises(InputError, match=r"is not installed: pip install 'lfrtorch\[files\]'"):
+        open_table(tmp_path / name)
+
+
+def test_gaps_stay_gaps():
+    t = np.delete(TIMES, slice(200, 260))
+    table = SeriesTable(Path("a"), Path("a"), {"u": Series(t, t), "y": Series(t, 2 * t)})
+    (block,) = table.blocks([0, 1, 2])
+    np.testing.assert_array_equal(block, np.column_stack([t, t, 2 * t]))
+    assert not table.notes
