@@ -88,8 +88,9 @@ def load_records(
     """Measurements from files, each a record, by use: training, validation and test.
 
     Text (.csv, .tsv, .txt, .dat, .lvm, also .gz) with or without header, units line and preamble;
-    MATLAB (.mat), .npz, .npy, HDF5 (.h5, .hdf5), Parquet and Excel (.xlsx, .xlsm); MDF4 (.mf4), TDMS
-    (.tdms), MCAP and ROS 2 bags (.mcap, .db3) and UFF58 (.uff, .unv), ``"drive.mf4#50Hz"`` at one rate.
+    MATLAB (.mat), .npz, .npy, HDF5 (.h5, .hdf5), Parquet and Excel (.xlsx, .xlsm); MDF4 (.mf4),
+    TDMS (.tdms), MCAP and ROS 2 bags (.mcap, .db3) and UFF58 (.uff, .unv), at one rate as
+    ``"drive.mf4#50Hz"``.
 
     What is cut off by a fraction begins where its record begins and is simulated from there: only
     its own part is scored, so that the transient of the start reaches neither validation nor test.
