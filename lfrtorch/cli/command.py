@@ -39,6 +39,10 @@ def main() -> None:
 def start(command: str) -> None:
     """Start a command; its help comes without what computes, which takes seconds to import."""
     if {"--help", "-h"}.isdisjoint(sys.argv):
+        if command in ("fit", "linear"):
+            from lfrtorch.cli import early
+
+            early.check("config" if command == "fit" else command)
         import_module(f"lfrtorch.cli.{command}").launch()
     else:
         import hydra

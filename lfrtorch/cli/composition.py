@@ -7,7 +7,9 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
+from copy import deepcopy
 from difflib import get_close_matches
+from functools import lru_cache
 from pathlib import Path
 
 import hydra
@@ -245,9 +247,14 @@ def first_run(word: Override) -> str:
 
 def composed(command: str, words: Sequence[str] = ()) -> DictConfig:
     """The configuration; where Hydra cannot make one, the first line of its reason."""
+    return deepcopy(_composed(CONF, command, tuple(words)))
+
+
+@lru_cache(maxsize=8)  # a command line is composed several times on its way, 0.1 s each
+def _composed(folder: Path, command: str, words: tuple[str, ...]) -> DictConfig:
     try:
         within = GlobalHydra.instance().is_initialized()  # a command of Hydra, at its end
-        with nullcontext() if within else initialize_config_dir(**COMPOSED, config_dir=str(CONF)):
+        with nullcontext() if within else initialize_config_dir(**COMPOSED, config_dir=str(folder)):
             cfg = compose(command, list(words))
             OmegaConf.to_container(cfg, resolve=True)  # a name that stands for nothing is an error
             return cfg

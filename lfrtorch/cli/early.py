@@ -1,0 +1,76 @@
+"""What is wrong with the words of a fit, said before torch is imported, which takes seconds."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import fields
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.paths import expanded
+from lfrtorch._support.settings import check_settings
+from lfrtorch.cli.composition import (
+    check_words,
+    chosen_by_data,
+    composed,
+    first_run,
+    in_full,
+    parsed,
+)
+from lfrtorch.cli.errors import user_errors
+from lfrtorch.files.formats import open_table
+from lfrtorch.fitting.plain_settings import PlainSettings
+from lfrtorch.least_squares.options import AdamOptions, LevenbergMarquardtOptions
+
+_SIZES = {"nx", "nz", "nw", "nn", "degree"}
+
+
+def check(command: str) -> None:
+    """End the program with a message if its words, numbers, file or columns cannot be."""
+    given = sys.argv[1:]
+    if any(word.startswith("-") or word.startswith("resume=") for word in given):
+        return  # several runs, options of Hydra, or the words of another run
+    with user_errors():
+        words = in_full(command, given)
+        whole = [*words, *chosen_by_data(words)] if command == "config" else words
+        check_words(command, words, whole)
+        cfg = composed(command, [first_run(parsed(word)) for word in whole])
+        if command == "config":
+            check_numbers(cfg)
+        check_columns(cfg.get("data"))
+
+
+def check_numbers(cfg: DictConfig) -> None:
+    """Refuse plain settings beyond their limits."""
+    plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    own = {one.name: plain[one.name] for one in fields(PlainSettings)}
+    brought = cfg.init_from is not None or cfg.known._target_ is not None
+    check_settings(PlainSettings(**own), without=_SIZES if brought else ())
+    trainer = plain["trainer"]
+    of_adam = str(trainer.get("_target_")).endswith("Adam")
+    kind: Any = AdamOptions if of_adam else LevenbergMarquardtOptions
+    names = {one.name for one in fields(kind)}
+    options = {k: v for k, v in trainer.items() if k in names and not isinstance(v, dict)}
+    try:
+        check_settings(kind(**options))
+    except InputError as error:
+        raise InputError(f"trainer: {error}") from None
+
+
+def check_columns(data: Any) -> None:
+    """Refuse a file or columns that are not there, of a single file."""
+    if data is None:
+        return
+    path = data.get("path")
+    if not isinstance(path, str) or {"*", "?"} & set(path):
+        return
+    try:
+        table = open_table(expanded(path))
+        for side in ("inputs", "outputs"):
+            if data.get(side) is not None:
+                value: Any = OmegaConf.to_container(data)
+                table.find(value[side], side)
+    except (InputError, OSError) as error:
+        raise InputError(f"data: {error}") from None

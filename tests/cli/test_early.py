@@ -1,0 +1,58 @@
+"""What is wrong with a command line is said before torch is imported, and as it is said later."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lfrtorch.cli import early
+
+ENDS = "import sys; from lfrtorch.cli.command import start; sys.argv = ['lfrtorch fit', *{words}]"
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "x.csv"
+    np.savetxt(path, np.zeros((20, 2)), delimiter=",", header="force,disp", comments="")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nx=three"], "nx is 'three'; give a whole number of at least 1, or auto"),
+        (["nx=-3"], "nx is -3; give a whole number of at least 1, or auto"),
+        (["nxx=3"], "there is no setting 'nxx'; did you mean nx=3?"),
+        (["nx=3", "trainer.max_iter=ten"], "trainer: max_iter is 'ten'; give a whole number"),
+        (["nx=3", "inputs=power"], "has no column 'power', named in inputs"),
+        (["+bench=boucwe"], "there is no bench=boucwe; give boucwen"),
+    ],
+)
+def test_errors_come_before_torch(file: Path, words: list[str], message: str):
+    known = [] if words[0].startswith("+") else [str(file), "outputs=disp", "fs=100"]
+    known += [] if any("inputs" in word for word in words) or not known else ["inputs=force"]
+    code = ENDS.format(words=[*known, *words])
+    code += "\ntry:\n    start('fit')\nfinally:\n    assert 'torch' not in sys.modules"
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=file.parent, check=False
+    )
+    assert ended.returncode == 1
+    assert message in ended.stderr.replace("\n  ", " ")
+    assert "Traceback" not in ended.stderr
+
+
+def test_what_is_right_passes(file: Path, monkeypatch: pytest.MonkeyPatch):
+    for words in (
+        [str(file), "inputs=force", "outputs=disp", "fs=100", "nx=auto"],
+        ["+bench=boucwen"],
+        ["+bench=boucwen", "trainer=adam", "trainer.max_iter=5"],
+        ["-m", "+bench=boucwen", "nx=1,2"],
+        ["resume=runs/nowhere"],
+        ["+bench=nanodrone", "data.root=nowhere"],
+    ):
+        monkeypatch.setattr(sys, "argv", ["lfrtorch fit", *words])
+        early.check("config")
