@@ -40,6 +40,7 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.job import identify
+from lfrtorch.reporting.preview import Preview, preview
 from lfrtorch.reporting.run import Run
 
 # scores
@@ -70,6 +71,7 @@ __all__ = [
     "OrderScan",
     "Parameter",
     "Polynomial",
+    "Preview",
     "Published",
     "Reason",
     "Record",
@@ -95,6 +97,7 @@ __all__ = [
     "mean_model",
     "multisine",
     "nrmse",
+    "preview",
     "refit",
     "reporting",
     "rmse",
