@@ -10,9 +10,10 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+import torch
 
 import lfrtorch
-from lfrtorch.cli.command import COMMANDS
+from lfrtorch.cli.command import COMMANDS, versions
 from lfrtorch.datasets import boucwen, official
 from lfrtorch.reporting import plots
 
@@ -177,6 +178,12 @@ def test_version_is_the_same_everywhere():
 
 
 @pytest.mark.numeric
+def test_the_version_names_what_computes():
+    said = versions()
+    assert said.startswith(f"lfrtorch {lfrtorch.__version__} (torch {torch.__version__}, numba ")
+    assert "Python 3." in said
+
+
 def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The eight lines of the README, as they stand."""
     text = (ROOT / "README.md").read_text()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 from importlib.metadata import version
+from typing import Any
 
 from lfrtorch.cli import CONF
 from lfrtorch.cli.interrupts import at_once, handled
@@ -25,7 +26,7 @@ def main() -> None:
     """Start the command that the first word names; its own words follow."""
     word = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if word == "--version":
-        print(f"lfrtorch {version('lfrtorch')}")
+        print(versions())
     elif word in ("--help", "-h"):
         print(usage())
     elif word in COMMANDS:
@@ -53,6 +54,18 @@ def start(command: str) -> None:
         declared.register()
         name = "config" if command == "fit" else command
         hydra.main(**MAIN, config_path=str(CONF), config_name=name)(lambda _: None)()
+
+
+def versions() -> str:
+    """Versions of lfrtorch and of what computes for it, as a report of a fault needs them."""
+    import numpy as np
+
+    built: Any = np.show_config(mode="dicts")  # pyright: ignore[reportCallIssue]
+    blas = built["Build Dependencies"]["blas"]
+    others = ", ".join(f"{name} {version(name)}" for name in ("torch", "numba", "numpy", "scipy"))
+    python = ".".join(map(str, sys.version_info[:3]))
+    library = f"{blas['name']} {blas['version']}"
+    return f"lfrtorch {version('lfrtorch')} ({others}, {library}, Python {python})"
 
 
 def usage() -> str:
