@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from importlib import import_module
 from importlib.metadata import version
@@ -40,6 +41,7 @@ def main() -> None:
 def start(command: str) -> None:
     """Start a command; its help comes without what computes, which takes seconds to import."""
     if {"--help", "-h"}.isdisjoint(sys.argv):
+        logging.getLogger("numexpr").setLevel(logging.WARNING)  # pandas has it tell its threads
         if command in ("fit", "linear"):
             from lfrtorch.cli import early
 
