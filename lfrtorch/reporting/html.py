@@ -80,6 +80,7 @@ def render(
         sizes=static_map(run.metrics["sizes"], run.metrics["known_states"]),
         comparisons=comparisons(run.evaluation),
         linear_is_used=run.verdict.use == LINEAR_MODEL,
+        used="RUN/linear" if run.verdict.use == LINEAR_MODEL else "RUN",
         scores=_scores(run.metrics, run.evaluation),
         data=_data(run.evaluation),
         records=[{"name": name, "views": list(own.items())} for name, own in (views or {}).items()],
@@ -189,7 +190,15 @@ def _data(evaluation: Evaluation) -> dict[str, Any]:
          r.period]
         for one, r in ((response, response.record) for response in evaluation.simulations)
     ]  # fmt: skip
+    ranges = [
+        f"{name} {number(low)} to {number(high)} {unit}".rstrip()
+        for name, side, unit, _, _, low, high in channels
+        if side == "input"
+    ]
+    more = f" and {len(ranges) - _FEW} more" if len(ranges) > _FEW else ""
     return {
+        "fs": fs,
+        "ranges": ", ".join(ranges[:_FEW]) + more,
         "summary": summary,
         "channels": channels,
         "records": records,

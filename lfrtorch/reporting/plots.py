@@ -43,6 +43,7 @@ COLOURS = tuple(colour for colour in CHANNELS if colour != LINEAR)
 """Of the models that are not linear; there are no more of them in a figure."""
 
 _HEIGHT = 4.2  # of an output in a figure, in inches
+_INPUTS, _MOST_INPUTS = 1.6, 5  # height of the inputs above, and how many are drawn
 _WIDE, _NARROW = 6.4, 4.4  # of figures that stand side by side on a wide page
 
 
@@ -202,11 +203,15 @@ def _overlay(
     fits: bool = False,
 ) -> Figure:
     """Measured and simulated outputs of a part of the scored samples, and the errors below."""
+    # With ``fits`` the inputs stand above, as what the outputs answer to.
     numbers = list(range(record.y.shape[1]) if outputs is None else outputs)
-    figure = Figure(figsize=(width, _HEIGHT * len(numbers)), layout="constrained")
-    axes = figure.subplots(
-        2 * len(numbers), 1, squeeze=False, sharex=True, height_ratios=[2, 1] * len(numbers)
-    )[:, 0]
+    height = _HEIGHT * len(numbers) + _INPUTS * fits
+    figure = Figure(figsize=(width, height), layout="constrained")
+    ratios = [1] * fits + [2, 1] * len(numbers)
+    grid = figure.add_gridspec(len(ratios), 1, height_ratios=ratios)
+    axes: list[Axes] = []
+    for row in range(fits, len(ratios)):
+        axes.append(figure.add_subplot(grid[row], sharex=axes[0] if axes else None))
     scored = slice(record.skip, None)
     t = (record.skip + np.arange(record.samples - record.skip)[part]) / record.fs
     for k, i in enumerate(numbers):
@@ -231,6 +236,16 @@ def _overlay(
             ax.margins(x=0)
             ax.grid(True, alpha=0.2)
         legend_above(above)
+    if fits:
+        above = figure.add_subplot(grid[0], sharex=axes[0])
+        for i, channel in enumerate(record.inputs[:_MOST_INPUTS]):
+            above.plot(*envelope(t, record.u[scored, i][part]), lw=0.8, label=str(channel))
+        above.set_ylabel("input")
+        above.grid(True, alpha=0.2)
+        legend_above(above)
+        axes.insert(0, above)
+    for ax in axes[:-1]:
+        ax.tick_params(labelbottom=False)
     figure.align_ylabels(axes)
     figure.suptitle(f"{record.name} ({record.source})", fontsize="medium")
     axes[-1].set_xlabel("time in the record (s)" if record.fs != 1.0 else "sample of the record")

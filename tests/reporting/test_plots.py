@@ -61,7 +61,7 @@ def test_figures_of_a_linear_model_have_its_lines_alone():
         assert plots.is_whole(record) == (draw is plots.spectrum)
         figure = draw(record, both(0.9 * Y))
         assert labels(figure.axes[0]) == lines
-        assert f"({unit})" in figure.axes[-1].get_xlabel()
+        assert any(f"({unit})" in ax.get_xlabel() for ax in figure.axes)
     assert labels(plots.close_up(RECORD, both(0.9 * Y)).axes[0]) == ["measured", "linear"]
 
 
@@ -79,7 +79,7 @@ def test_response_overlays_the_scored_samples_with_the_errors_below():
 
 def test_small_signals_have_axes_with_a_prefix():
     record = Record(T, 1e-6 * Y, 100.0, outputs=(Channel("a", "m"), Channel("b", "kg")))
-    above, below, other, _ = plots.response(record, both(0.9e-6 * Y)).axes
+    above, below, other, *_ = plots.response(record, both(0.9e-6 * Y)).axes
     said = [ax.get_ylabel() for ax in (above, below, other)]
     assert said == ["a (µm)", "error (nm)", "b (kg)"]
     assert below.yaxis.get_major_formatter()(50e-9) == "50"
@@ -114,7 +114,7 @@ def test_distribution_says_where_most_errors_are():
 
 def test_some_of_many_outputs_are_drawn():
     figure = plots.response(RECORD, both(0.9 * Y), outputs=[1])
-    assert [ax.get_ylabel() for ax in figure.axes] == ["b", "error"]
+    assert [ax.get_ylabel() for ax in figure.axes] == ["b", "error", "input"]
     assert len(plots.spectrum(RECORD, both(0.9 * Y), outputs=[1]).axes) == 1
 
 
@@ -131,6 +131,14 @@ def test_density_integrates_to_the_power():
     assert "dB, re 1 m²/Hz" in ax.get_ylabel()
     short = Record(y[:10], y[:10], skip=5)
     assert len(drawn(plots.density(short, both(0 * y[:10], y[:10])).axes[0], "output")) == 2
+
+
+def test_the_inputs_stand_above_the_outputs():
+    *others, inputs = plots.response(RECORD, both(0.9 * Y)).axes
+    assert inputs.get_ylabel() == "input"
+    assert len(inputs.get_lines()) == RECORD.u.shape[1]
+    assert len(others) == 2 * RECORD.y.shape[1]
+    assert inputs.get_xlim() == others[0].get_xlim()
 
 
 def test_close_up_is_about_the_largest_error():
