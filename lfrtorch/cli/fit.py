@@ -50,7 +50,7 @@ from lfrtorch.distributed import ProcessLostError, Ranks, connect
 from lfrtorch.fitting.observer import Watching
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.snapshots import Snapshots
-from lfrtorch.fitting.trainer import FitResult, StoppedError
+from lfrtorch.fitting.trainer import FitResult, Round, StoppedError
 from lfrtorch.job import identify
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -137,7 +137,12 @@ class _Folder(Console):
             for i in range(len(models))
         ]
         own = zip(printing, self._boards, strict=True)
-        return Watching([[*lines, board, keep] for lines, board in own], watch)
+
+        def told(ended: Round) -> None:
+            watch(ended)
+            self.board.round(ended)
+
+        return Watching([[*lines, board, keep] for lines, board in own], told)
 
     def note(self, text: str) -> None:
         self.say(f"note: {text}")

@@ -83,10 +83,12 @@ class ProgressLine:
 
     def __init__(self, every: int | None = 10, stream: TextIO | None = None) -> None:
         self._every, self._line, self._unseen = every, LiveLine(stream), ""
+        self._best: Progress | None = None
 
     def __call__(self, model: Model, progress: Progress) -> None:
         """Show the progress."""
-        text = _progress_text(progress, common_unit(model.outputs))
+        self._best = progress if progress.best else self._best
+        text = _progress_text(progress, common_unit(model.outputs), self._best)
         self._line.show(text)
         if not self._line.live and self._every is not None:
             self._unseen = text
@@ -101,12 +103,15 @@ class ProgressLine:
         self._unseen = ""
 
 
-def _progress_text(progress: Progress, unit: str) -> str:
-    """Write iteration, errors, time left and scalars of the trainer."""
+def _progress_text(progress: Progress, unit: str, best: Progress | None = None) -> str:
+    """Write iteration, errors beside the best so far, time left and scalars of the trainer."""
     limit = str(progress.limit)
     parts = [f"{progress.iteration:>{len(limit)}}/{limit}", *_errors(progress, unit)]
     if progress.best and not math.isnan(progress.validation):
         parts[-1] += "*"
+    elif best is not None and not math.isnan(best.validation):
+        (least,) = quantities([best.validation], unit, _DIGITS)
+        parts[-1] += f" (best {least})"
     if progress.iteration:
         parts.append(f"{_duration(progress.seconds_left)} left")
     shown = {"damping": "damping", "gain_ratio": "gain", "gradient_norm": "|gradient|"}
@@ -130,6 +135,15 @@ def _duration(seconds: float) -> str:
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def errors_of_round(ended: Round) -> dict[str, float]:
+    """The best of the starts' errors, and of several the median and the worst, too."""
+    judged = [(s.selection, s.validation, s.train) for s in ended.starts]
+    found = [next(e for e in each if not math.isnan(e)) for each in judged]
+    numbers = {"best": found[0], "median": median(found), "worst": max(found)}
+    kept = ["best", *["median"] * (len(found) > 2), *["worst"] * (len(found) > 1)]
+    return {name: numbers[name] for name in kept}
 
 
 class StartsLine:
@@ -168,7 +182,8 @@ class StartsLine:
         if self._best is None or progress.score < self._best.score:
             self._best = progress
         parts = [f"{count}/{self._all} iterations of {self._starts} starts"]
-        parts += _errors(self._best, self._unit)
+        parts += _errors(progress, self._unit)
+        parts.append(f"best {_errors(self._best, self._unit)[-1]}")
         if 0 < count < self._all:
             each = (monotonic() - self._clock) / count
             parts.append(f"{_duration(each * (self._all - count))} left")
@@ -176,14 +191,11 @@ class StartsLine:
 
     def round(self, ended: Round) -> None:
         """Show a round that has ended."""
-        judged = [(s.selection, s.validation, s.train) for s in ended.starts]
-        found = [next(e for e in each if not math.isnan(e)) for each in judged]
-        names = ["best", *["median"] * (len(found) > 2), *["worst"] * (len(found) > 1)]
-        numbers = {"best": found[0], "median": median(found), "worst": max(found)}
-        shown = quantities([numbers[name] for name in names], self._unit, _DIGITS)
-        errors = ", ".join(f"{name} {value}" for name, value in zip(names, shown, strict=True))
+        numbers = errors_of_round(ended)
+        shown = quantities([*numbers.values()], self._unit, _DIGITS)
+        errors = ", ".join(f"{name} {value}" for name, value in zip(numbers, shown, strict=True))
         self._line.say(
-            f"round {ended.number} of {ended.count}: {len(found)} start(s) to iteration "
+            f"round {ended.number} of {ended.count}: {len(ended.starts)} start(s) to iteration "
             f"{max(s.iterations for s in ended.starts)}, {errors}, {ended.seconds:.0f} s"
         )
 

@@ -22,8 +22,9 @@ from torch.utils.tensorboard.summary import hparams
 from lfrtorch._support.errors import InputError
 from lfrtorch.analysis.model_plots import static_figure
 from lfrtorch.engine.simulation import spectral_radius
+from lfrtorch.fitting.live_line import errors_of_round
 from lfrtorch.fitting.multistart import ROUNDS
-from lfrtorch.fitting.trainer import Progress
+from lfrtorch.fitting.trainer import Progress, Round
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 from lfrtorch.reporting import plots
@@ -48,6 +49,8 @@ class TensorBoard:
         self.folder, self.finalist, self._say = Path(folder), finalist, say
         self.record, self.y_linear, self.every = record, y_linear, every
         self._writer: SummaryWriter | None = None
+        self.follows = False
+        """Whether iterations of a fit are written."""
         self._failed = False
         self._waiting: list[tuple[Progress, float]] = []
 
@@ -58,6 +61,7 @@ class TensorBoard:
 
     def history(self, history: Sequence[Progress]) -> None:
         """Log iterations of the past."""
+        self.follows = True
         for progress in history:
             self._write(progress.iteration, lambda writer, one=progress: _add(writer, one))
 
@@ -76,6 +80,12 @@ class TensorBoard:
             self.figure("signals/response", plots.response(self.record, simulated), step)
             with suppress(InputError):  # a linear model, or one that diverges
                 self.figure("signals/static_map", static_figure(model, self.record), step)
+
+    def round(self, ended: Round) -> None:
+        """Log the errors of several starts after a round of theirs."""
+        step = max(start.iterations for start in ended.starts)
+        for name, error in errors_of_round(ended).items():
+            self._scalar(f"starts/{name}", error, step)
 
     def figure(self, name: str, figure: Figure, step: int) -> None:
         """Add a figure."""

@@ -3,6 +3,7 @@
 import io
 import math
 import shutil
+from dataclasses import replace
 from os import terminal_size
 
 import numpy as np
@@ -62,6 +63,8 @@ def test_text_names_every_number():
         " 4/40  train 1.500 mm  validation 2.500 mm*  72 s left  damping 0.12  gain 0.75"
     )
     assert "left" not in _progress_text(step(0), "m")
+    worse = replace(step(5), validation=4e-3)
+    assert "validation 4.000 mm (best 2.500 mm)  " in _progress_text(worse, "m", step(4))
 
 
 def test_a_file_gets_a_line_now_and_then_and_the_last(bla: lfrtorch.LinearModel):
@@ -121,7 +124,10 @@ def test_a_round_of_starts_is_a_line(bla: lfrtorch.LinearModel):
             "round 1 of 4: 3 start(s) to iteration 25, "
             "best 1.000 mm, median 2.000 mm, worst 5.000 mm, 7 s"
         ) in text
-        assert ("1/80 iterations of 3 starts  train 1.500 mm" in text) is live
+        shown = (
+            "1/80 iterations of 3 starts  train 1.500 mm  validation 2.500 mm  best validation 2"
+        )
+        assert (shown in text) is live
         assert text.count("\n") == 1
 
 

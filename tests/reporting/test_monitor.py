@@ -12,7 +12,7 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from tensorboard.summary.writer import event_file_writer
 
 import lfrtorch
-from lfrtorch.fitting.trainer import Progress
+from lfrtorch.fitting.trainer import Progress, RestartSummary, Round
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import plots
 from lfrtorch.reporting.monitor import Checkpoint, TensorBoard
@@ -138,3 +138,16 @@ def test_tensorboard_has_the_run_among_others(tmp_path: Path):
     assert HParamsPluginData.FromString(content).session_start_info.hparams.keys() == {"nn"}
     assert found.Scalars("found/validation")[0].value == 0.5
     assert "found/test" not in found.Tags()["scalars"]
+
+
+def test_rounds_of_several_starts_are_there_before_the_fit_ends(tmp_path: Path):
+    board = TensorBoard(tmp_path)
+    nan = float("nan")
+    starts = tuple(RestartSummary(i, 25, 1.0, e, nan, "") for i, e in ((3, 1e-3), (0, 2e-3)))
+    board.round(Round(1, 3, starts, 7.2))
+    assert board.begun
+    assert not board.follows  # the history of the best is yet to come
+    board.close()
+    found = events(tmp_path)
+    assert found.Scalars("starts/best")[0].step == 25
+    assert found.Scalars("starts/worst")[0].value == pytest.approx(2e-3)
