@@ -6,7 +6,7 @@ import json
 import math
 import os
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -54,6 +54,7 @@ class Compared:
     tests: Mapping[str, float]  # RMSE of each test
     linear: float  # error there of the linear model
     linear_nx: int | None
+    linear_tests: Mapping[str, float]  # RMSE of the linear model on each test
     unit: str  # of the errors, empty if they have several
     seconds: float  # that the fit took
     outcome: str
@@ -119,7 +120,23 @@ class Comparison:
         if whole:
             columns |= {"linear": lambda run: run.linear, "linear nx": lambda run: run.linear_nx}
         columns |= {"time (s)": lambda run: run.seconds, "outcome": lambda run: run.outcome}
-        return list(columns), [[cell(run) for cell in columns.values()] for run in self.runs]
+        rows = [[cell(run) for cell in columns.values()] for run in self.runs]
+        return list(columns), rows if whole else [*rows, *self._linear_row(list(columns), tests)]
+
+    def _linear_row(self, head: Sequence[str], tests: Iterable[str]) -> list[list[Cell]]:
+        """The errors of the best linear model among the runs, if there is one."""
+        linear = [run for run in self.runs if math.isfinite(run.linear)]
+        if not linear:
+            return []
+        best = min(linear, key=lambda run: run.linear)
+        factor, unit = self._scale
+        named = "" if best.linear_nx is None else f" (nx {best.linear_nx})"
+        known: dict[str, Cell] = {
+            "run": f"linear{named}",
+            f"validation{unit}": factor * best.linear,
+        }
+        known |= {f"{name}{unit}": times(factor, best.linear_tests.get(name)) for name in tests}
+        return [[known.get(column) for column in head]]
 
     def simulations(self, record: Record) -> dict[str, Array]:
         """Simulations of a record by the best runs, one of each setting, and by a linear model."""
@@ -156,9 +173,10 @@ class Comparison:
 
     def __str__(self) -> str:
         head, rows = self.rows()
-        parts = [f"{self.name}: RMSE of {len(rows)} run{'s' * (len(rows) > 1)}"]
-        parts.append(table(head, rows[:20]))
-        more = len(rows) - 20
+        count = len(self.runs)
+        parts = [f"{self.name}: RMSE of {count} run{'s' * (count > 1)}"]
+        parts.append(table(head, [*rows[: min(20, count)], *rows[count:]]))
+        more = count - 20
         parts.append(_LEGEND + f" {more} more runs are in the files." * (more > 0))
         return "\n\n".join(parts)
 
@@ -268,9 +286,11 @@ def _read(path: Path) -> Compared:
             tests={name: _float(score["rmse"]) for name, score in found["scores"].items()},
             linear=_float(judged["lti_rmse"]),
             linear_nx=found.get("lti_nx"),
+            linear_tests={n: _float(score.get("lti_rmse")) for n, score in found["scores"].items()},
             unit=unit_of(found),
             seconds=_float(found["fit"]["seconds"]),
-            outcome=found["fit"]["reason"],
+            outcome="kept the start: " * (found["fit"].get("chosen_iteration") == 0)
+            + found["fit"]["reason"],
         )
         "".join([run.dataset, run.unit, run.outcome])  # a TypeError if one is no text
     except (OSError, LookupError, AttributeError, TypeError, ValueError, RecursionError) as error:

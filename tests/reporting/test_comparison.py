@@ -27,14 +27,19 @@ ERRORS = {(5, 0): 4e-6, (5, 1): 2e-6, (10, 0): 1e-6, (10, 1): 3e-6, (15, 0): 2e-
 
 
 def written(folder: Path, nn: int, seed: int, error: float | None, bench: str = "tanks") -> None:
-    score = {"rmse": error, "unit": "m"}
+    score = {"rmse": error, "unit": "m", "lti_rmse": 2e-5}
     metrics = {
         "bench": bench,
         "command": f"lfrtorch fit +bench={bench} nn={nn} seed={seed}",
         "parameters_net": 10 + nn,
         "validation": {"rmse": error, "lti_rmse": 1e-5, "records": {"validation": score}},
         "scores": {"test": score},
-        "fit": {"seconds": 2.0 * nn, "reason": "maximum number of iterations"},
+        "lti_nx": 3,
+        "fit": {
+            "seconds": 2.0 * nn,
+            "reason": "maximum number of iterations",
+            "chosen_iteration": 0 if nn == 15 else 7,
+        },
     }
     folder.mkdir(parents=True)
     (folder / "metrics.json").write_text(json.dumps(metrics))
@@ -58,6 +63,10 @@ def test_front_and_settings(study: Path):
     assert "validation (µm)" in text
     head, rows = found.rows()
     assert head[4] == "median"
+    *rows, linear = rows
+    assert linear == ["linear (nx 3)", None, None, 10.0, None, 20.0, None, None]
+    assert "kept the start: maximum number of iterations" in str(rows[-1])
+    assert "kept" not in str(rows[0])
     medians = {str(row[0]).partition(",")[0]: row[4] for row in rows}
     assert medians == pytest.approx({"nn=10": 1.0, "nn=5": 2.0, "nn=15": 2.0})
     assert text.index("nn=10,seed=0") < text.index("nn=10,seed=1") < text.index("nn=15,seed=1")
