@@ -289,7 +289,7 @@ def _read(path: Path) -> Compared:
             linear_tests={n: _float(score.get("lti_rmse")) for n, score in found["scores"].items()},
             unit=unit_of(found),
             seconds=_float(found["fit"]["seconds"]),
-            outcome="kept the start: " * (found["fit"].get("chosen_iteration") == 0)
+            outcome="kept the start: " * (found.get("chosen_iteration") == 0)
             + found["fit"]["reason"],
         )
         "".join([run.dataset, run.unit, run.outcome])  # a TypeError if one is no text

@@ -25,6 +25,8 @@ from lfrtorch.reporting.verdict import Verdict
 ERRORS = "rmse", "lti_rmse"
 """Entries of a score in the unit of the outputs: of the NL-LFR and of the linear model."""
 
+_MOST_ROWS = 24  # of outputs on the terminal; the report has all
+
 
 def metrics(
     result: FitResult,
@@ -182,7 +184,28 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     references += [f"{p.label}: {p.reference}" for p in others if p.label in head]
     table = tables.table(head, cells)
     simulated = [f"{title}, {shown}", "", table, *[""] * bool(references), *references]
-    return "\n".join(simulated) + prediction_table(result) + sums_table(result, published)
+    more = [outputs_table(result), prediction_table(result), sums_table(result, published)]
+    return "\n".join(simulated) + "".join(more)
+
+
+def outputs_table(result: Mapping[str, Any]) -> str:
+    """Errors of each output if there are several, of the tests or else of validation."""
+    scored = result["scores"] or result["validation"]["records"]
+    rows: list[list[tables.Cell]] = []
+    for name, s in scored.items():
+        outputs = s.get("outputs", [])
+        units = s["unit"].split(", ")
+        units = units if len(units) == len(outputs) else units[:1] * len(outputs)
+        unknown = [None] * len(outputs)
+        errors = (s.get(f"{of}_by_output") or unknown for of in ("lti_rmse", "rmse"))
+        for output, unit, linear, error in zip(outputs, units, *errors, strict=True):
+            rows.append([name, output, unit, linear, error])
+    if not len(scored) < len(rows) <= _MOST_ROWS:  # a row a record is what the table above has
+        return ""
+    head = ["record", "output", "unit", linear_name(result), "NL-LFR"]
+    kept = [i for i in range(len(head)) if any(row[i] not in (None, "") for row in rows)]
+    listed = tables.table([head[i] for i in kept], [[row[i] for i in kept] for row in rows])
+    return f"\n\nRMSE of each output\n\n{listed}"
 
 
 def sums_table(result: Mapping[str, Any], published: Sequence[Published]) -> str:

@@ -35,11 +35,8 @@ def written(folder: Path, nn: int, seed: int, error: float | None, bench: str = 
         "validation": {"rmse": error, "lti_rmse": 1e-5, "records": {"validation": score}},
         "scores": {"test": score},
         "lti_nx": 3,
-        "fit": {
-            "seconds": 2.0 * nn,
-            "reason": "maximum number of iterations",
-            "chosen_iteration": 0 if nn == 15 else 7,
-        },
+        "fit": {"seconds": 2.0 * nn, "reason": "maximum number of iterations"},
+        "chosen_iteration": 0 if nn == 15 else 7,
     }
     folder.mkdir(parents=True)
     (folder / "metrics.json").write_text(json.dumps(metrics))

@@ -278,8 +278,9 @@ def test_records_of_a_group_have_one_score():
     assert f"board all mV {linear} {error}" in page
     a, b = (number(1e3 * score["rmse_by_output"][i]) for i in range(2))
     assert re.search(rf"a mV \S+ {a} .* b mV \S+ {b} ", page)
-    table = report.table(metrics, data.published).splitlines()
-    rows = {line.split("  ")[0]: line.split()[-1] for line in table if "  " in line}
+    table, by_output = report.table(metrics, data.published).split("RMSE of each output")
+    assert by_output.count("board") == 2
+    rows = {line.split("  ")[0]: line.split()[-1] for line in table.splitlines() if "  " in line}
     assert (rows["board"], rows["board b"], rows["validation b"]) == ("250", "125", "–")
     untested = report.table(metrics | {"scores": {}}, data.published)
     assert "validation b" in untested

@@ -167,3 +167,16 @@ def test_what_is_not_finite_becomes_null():
 def test_neurons_in_words():
     sizes = {"nx": 2, "nz": 1, "nw": 1, "nn": 0}
     assert report.static_map(sizes) == "nx 2, nz 1, nw 1, a map of one's own"
+
+
+def test_several_outputs_have_a_table_of_their_own():
+    score = {"unit": "m, V", "outputs": ["a", "b"], "rmse_by_output": [1.0, None]}
+    score |= {"lti_rmse_by_output": [2.0, 3.0]}
+    result = {"scores": {"test": score}, "validation": {"records": {}}, "lti_nx": 2}
+    shown = report.outputs_table(result)
+    assert "RMSE of each output" in shown
+    assert [line.split() for line in shown.splitlines()[-2:]] == [
+        ["test", "a", "m", "2.00", "1.00"], ["test", "b", "V", "3.00", "\N{EN DASH}"],
+    ]  # fmt: skip
+    one = {"unit": "m", "outputs": ["a"], "rmse_by_output": [1.0], "lti_rmse_by_output": [2.0]}
+    assert report.outputs_table({**result, "scores": {"test": one}}) == ""
