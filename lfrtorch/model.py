@@ -20,8 +20,7 @@ from lfrtorch._support import checkpoint
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, reals
 from lfrtorch._support.errors import InputError, brief
-from lfrtorch._support.frames import columns_of, framed, index_rate, is_frame
-from lfrtorch._support.headers import names_and_units
+from lfrtorch._support.frames import columns_of, framed, index_rate, is_frame, places_of
 from lfrtorch._support.types import Array
 from lfrtorch.data_reach import Cloud, DataReach
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, fixed_entries
@@ -368,18 +367,8 @@ class Model:
     def _inputs_of(self, frame: Any) -> Array:
         """The inputs among the columns of a frame."""
         index_rate(frame, self.fs)
-        headers = [str(column) for column in frame.columns]
-        named = [name for name, _ in names_and_units(headers, {})]
         wanted = [channel.name for channel in self.inputs]
-        missing = [name for name in wanted if name not in (*named, *headers)]
-        if missing:
-            raise InputError(
-                f"the frame has no column {', '.join(map(repr, missing))}, an input of the model; "
-                f"it has {headers}."
-            )
-        return columns_of(
-            frame, [(named if name in named else headers).index(name) for name in wanted]
-        )
+        return columns_of(frame, places_of(frame, wanted, "model's inputs"))
 
     def signals(
         self, data: Record | ArrayLike, *, start: Start | None = None, x0: ArrayLike | None = None

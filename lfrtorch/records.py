@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch._support.checks import integer, number, reals
 from lfrtorch._support.errors import InputError, brief
-from lfrtorch._support.frames import columns_of, index_rate, is_frame
+from lfrtorch._support.frames import columns_of, index_rate, is_frame, places_of
 from lfrtorch._support.headers import names_and_units
 from lfrtorch._support.types import Array, Booleans
 
@@ -191,24 +191,16 @@ class Record:
         """
         if not is_frame(frame):
             raise InputError(f"frame is {brief(repr(frame))}; give a pandas DataFrame.")
-        headers = [str(column) for column in frame.columns]
-        channels = [Channel(*each) for each in names_and_units(headers, {})]
-        called = {name: i for i, name in enumerate(headers)}
-        called = {channel.name: i for i, channel in enumerate(channels)} | called
-        sides = []
+        channels = [Channel(*each) for each in names_and_units([*map(str, frame.columns)], {})]
+        given: dict[str, Any] = {}
+        signals = []
         for side, names in (("inputs", inputs), ("outputs", outputs)):
-            listed = [names] if isinstance(names, str) else list(names)
-            missing = [name for name in listed if name not in called]
-            if missing or not listed:
-                raise InputError(
-                    f"{side} is {names!r}; give names of columns of the frame: {headers}."
-                )
-            sides.append([called[name] for name in listed])
-        u, y = (columns_of(frame, side) for side in sides)
-        named = (tuple(channels[i] for i in side) for side in sides)
+            places = places_of(frame, [names] if isinstance(names, str) else names, side)
+            given[side] = tuple(channels[i] for i in places)
+            signals.append(columns_of(frame, places))
+        u, y = signals
         valid = None if np.isfinite(y).all() else np.isfinite(y)
-        given = {**dict(zip(("inputs", "outputs"), named, strict=True)), "valid": valid, **options}
-        return cls(u, y, index_rate(frame, fs), **given)
+        return cls(u, y, index_rate(frame, fs), **given, **{"valid": valid, **options})
 
     def _measured(self) -> ArrayLike:
         """The output, interpolated where it is not valid."""

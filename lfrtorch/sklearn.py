@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -14,6 +13,7 @@ from lfrtorch._support.frames import columns_of, is_frame
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset
+from lfrtorch.files.split import cut
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.job import identify
@@ -105,13 +105,9 @@ class NLLFR(base.MultiOutputMixin, base.RegressorMixin, base.BaseEstimator):
         """The records, the last part of each for validation."""
         if not 0.0 <= self.validation < 1.0:
             raise InputError(f"validation is {self.validation}; give a part from 0 to below 1.")
-        train, chosen = [], []
-        for record in records:
-            end = record.samples - round(record.samples * self.validation)
-            train.append(record[:end] if end < record.samples else record)
-            if end < record.samples:
-                chosen.append(replace(record, skip=max(record.skip, end)))
-        return Dataset("arrays", train, chosen, [])
+        parts = [cut(record, self.validation, 0.0) for record in records]
+        chosen = [part["validation"] for part in parts if "validation" in part]
+        return Dataset("arrays", [part["train"] for part in parts], chosen, [])
 
     def predict(self, X: Any) -> Array:
         """The simulated output, (T,) or (T, ny), from x = 0."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.headers import names_and_units
 from lfrtorch._support.types import Array
 
 _UNEVEN = 0.4
@@ -26,7 +27,7 @@ def index_times(frame: Any) -> Array | None:
     import pandas as pd
 
     index = frame.index
-    if isinstance(index, pd.RangeIndex):
+    if isinstance(index, pd.RangeIndex) or not len(index):
         return None
     if isinstance(index, pd.DatetimeIndex | pd.TimedeltaIndex):
         return (index - index[0]).total_seconds().to_numpy(np.float64)
@@ -58,6 +59,20 @@ def index_rate(frame: Any, fs: float | None) -> float:
     if fs is not None and abs(fs * step - 1.0) > 0.01:
         raise InputError(f"fs is {fs:g} Hz and the frame's index says {1.0 / step:g} Hz.")
     return 1.0 / step if fs is None else fs
+
+
+def places_of(frame: Any, wanted: Sequence[str], side: str) -> list[int]:
+    """Numbers of columns by header, "force (N)", or by the name in it; messages name the side."""
+    headers = [str(column) for column in frame.columns]
+    names = [name for name, _ in names_and_units(headers, {})]
+    found = []
+    for one in wanted:
+        known = next((own for own in (headers, names) if one in own), [])
+        if known.count(one) != 1:
+            several = f"{known.count(one)} columns" if known else "no column"
+            raise InputError(f"the frame has {several} {one!r}, of the {side}; it has {headers}.")
+        found.append(known.index(one))
+    return found
 
 
 def columns_of(frame: Any, wanted: Sequence[int]) -> Array:

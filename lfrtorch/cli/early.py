@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import fields
 from typing import Any
@@ -20,7 +21,9 @@ from lfrtorch.cli.composition import (
     parsed,
 )
 from lfrtorch.cli.errors import user_errors
+from lfrtorch.files.excel import EXTENSIONS, workbook
 from lfrtorch.files.formats import open_table
+from lfrtorch.files.loggers import READERS
 from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.least_squares.options import AdamOptions, LevenbergMarquardtOptions
 
@@ -32,7 +35,7 @@ def check(command: str) -> None:
     given = sys.argv[1:]
     if any(word.startswith("-") or word.startswith("resume=") for word in given):
         return  # several runs, options of Hydra, or the words of another run
-    with user_errors():
+    with user_errors(os.environ.get("RANK", "0")):
         words = in_full(command, given)
         whole = [*words, *chosen_by_data(words)] if command == "config" else words
         check_words(command, words, whole)
@@ -60,12 +63,14 @@ def check_numbers(cfg: DictConfig) -> None:
 
 
 def check_columns(data: Any) -> None:
-    """Refuse a file or columns that are not there, of a single file."""
+    """Refuse a file or columns that are not there, of a single file that opens without delay."""
     if data is None:
         return
     path = data.get("path")
     if not isinstance(path, str) or {"*", "?"} & set(path):
         return
+    if workbook(expanded(path))[0].suffix.lower() in (*EXTENSIONS, *READERS):
+        return  # these are read whole
     try:
         table = open_table(expanded(path))
         for side in ("inputs", "outputs"):

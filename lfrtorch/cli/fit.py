@@ -137,10 +137,12 @@ class _Folder(Console):
             for i in range(len(models))
         ]
         own = zip(printing, self._boards, strict=True)
+        rounds = TensorBoard(self.folder / STARTS, say=self.note)
+        self._boards.append(rounds)
 
         def told(ended: Round) -> None:
             watch(ended)
-            self.board.round(ended)
+            rounds.round(ended)
 
         return Watching([[*lines, board, keep] for lines, board in own], told)
 

@@ -47,7 +47,7 @@ class LFRCell(nn.Module):
         y  = Cy x + Dyu u + Dyw w
 
     The matrices start at random, see ``reset_parameters``; ``lfrtorch.initialise`` writes the best
-    linear approximation, from which a fit takes a hundredth of the iterations.
+    linear approximation, from which a fit takes far fewer iterations.
 
     Args:
         nu, ny, nx, nz, nw: sizes; ``nz = nw = 0`` without ``static`` is a linear model.

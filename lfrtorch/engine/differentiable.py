@@ -89,7 +89,8 @@ class _Adjoint(_Once):
         cell: LFRCell, periodic: bool, e: Tensor, end: Tensor, u: Tensor, x: Tensor, z: Tensor,
         w: Tensor, *weights: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-        about = Linearisation(cell, u, Trajectory(x, z, w, e), periodic=periodic, weights=weights)
+        signals = Trajectory(x, z, w, e)  # y does not matter
+        about = Linearisation(cell, u, signals, periodic=periodic, weights=weights)
         found = about.adjoint(e, end)
         return found.u, found.x0, found.theta
 
@@ -108,7 +109,7 @@ class _Tangent(_Once):
         w: Tensor, *both: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         changes, weights = both[: len(both) // 2], both[len(both) // 2 :]
-        signals = Trajectory(x, z, w, u)
+        signals = Trajectory(x, z, w, u)  # y does not matter
         about = Linearisation(cell, u, signals, periodic=periodic, weights=weights)
         d_theta = torch.cat([change.flatten() for change in changes])
         return about.tangent_with_end(d_theta, None if periodic else d_x0, d_u)

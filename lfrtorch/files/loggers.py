@@ -126,10 +126,15 @@ def _decoder(schema: Any, encoding: str) -> Callable[[bytes], Any]:
     if encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
         typesys = optional("rosbags.typesys")
         store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-        known = typesys.get_types_from_msg(schema.data.decode(), schema.name)
-        store.register({name: one for name, one in known.items() if name not in store.types})
+        _learn(store, schema.data.decode(), schema.name)
         return lambda data: store.deserialize_cdr(data, schema.name)
     return lambda data: None  # a topic in another encoding has no channels
+
+
+def _learn(store: Any, definition: str, name: str) -> None:
+    """Let a store of message types know one, and those that it is made of."""
+    known = optional("rosbags.typesys").get_types_from_msg(definition, name)
+    store.register({each: one for each, one in known.items() if each not in store.types})
 
 
 def _bag(path: Path) -> dict[str, Series]:
@@ -140,9 +145,8 @@ def _bag(path: Path) -> dict[str, Series]:
     def messages() -> Iterator[tuple[str, int, Any]]:
         with rosbag2.Reader(path.parent) as bag:
             for connection in bag.connections:
-                if connection.msgtype not in store.types and connection.msgdef.data:
-                    known = typesys.get_types_from_msg(connection.msgdef.data, connection.msgtype)
-                    store.register({n: one for n, one in known.items() if n not in store.types})
+                if connection.msgdef.data:
+                    _learn(store, connection.msgdef.data, connection.msgtype)
             for connection, time, data in bag.messages():
                 yield connection.topic, time, store.deserialize_cdr(data, connection.msgtype)
 

@@ -2,8 +2,8 @@
 
 Channels of one clock are read together. A clock that runs unevenly, as messages do that come over a
 network, is replaced by an even one of its mean rate, and so are clocks of equal rates that began at
-other instants; the channels are interpolated linearly. Channels of different rates are refused
-together, unless the path ends in a rate for all: ``drive.mf4#50Hz``.
+other instants; the channels are interpolated linearly, NaN where they do not run. Channels of
+different rates are refused together, unless the path ends in a rate for all: ``drive.mf4#50Hz``.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ _SAME = 0.01
 _HOLE = 5
 """Steps without a sample that are a gap, and not what messages do."""
 
+_LONG = 0.5
+"""Of the longest time that a channel lasts: one that lasts less does not cut the others."""
+
 _RATE = re.compile(r"([0-9.]+)\s*(k?)Hz", re.IGNORECASE)
 
 
@@ -40,11 +43,10 @@ class Series(NamedTuple):
 
 
 class _Clock(NamedTuple):
-    """An even grid, or instants that have gaps."""
+    """Instants, and their mean rate in Hz."""
 
     t: Array
     fs: float
-    even: bool
 
 
 class SeriesTable(Table):
@@ -66,11 +68,12 @@ class SeriesTable(Table):
             self._columns.append(clock.t)
             self._clock_of.append(i)
         for (name, each), i in zip(found.items(), of_channel, strict=True):
-            header = name if name not in headers else f"{name} (channel)"
+            header = name if name not in headers else f"channel {name}"
             headers.append(header)
             units[header] = each.unit
-            same = len(each.t) == len(clocks[i].t) and np.array_equal(each.t, clocks[i].t)
-            values = each.values if same else np.interp(clocks[i].t, each.t, each.values)
+            on, values = clocks[i].t, each.values
+            if not np.array_equal(each.t, on):
+                values = np.interp(on, each.t, values, left=np.nan, right=np.nan)
             self._columns.append(values)
             self._clock_of.append(i)
         self._clocks = clocks
@@ -122,14 +125,10 @@ def _clocks(
     times: Sequence[Array], asked: float | None
 ) -> tuple[list[_Clock], list[int], list[int]]:
     """The clocks, that of each channel, and those that channels are interpolated to."""
-    begin = min(t[0] for t in times)
     if asked is not None:
-        common = max(t[0] for t in times), min(t[-1] for t in times)
-        grid = np.arange(common[0], common[1] * (1 + 1e-12), 1.0 / asked) - begin
-        if len(grid) < 2:
-            raise InputError("the channels have no common stretch of time.")
-        shared = _Clock(grid + begin, asked, even=True)
-        return [shared], [0] * len(times), [0]
+        longest = max(t[-1] - t[0] for t in times)
+        long = [t for t in times if t[-1] - t[0] >= _LONG * longest]
+        return [_Clock(_common(long, asked), asked)], [0] * len(times), [0]
     own: list[Array] = []
     number: list[int] = []
     for t in times:
@@ -142,7 +141,7 @@ def _clocks(
     whole = [_gapless(t, fs) for t, fs in zip(own, rates, strict=True)]
     for i, fs in enumerate(rates):
         near = (g for g in groups if abs(rates[g[0]] / fs - 1) < _SAME and whole[i] and whole[g[0]])
-        group = next(near, None)
+        group = next((g for g in near if _together(own[i], own[g[0]])), None)
         if group is None:
             groups.append([i])
         else:
@@ -153,14 +152,27 @@ def _clocks(
         fs = rates[group[0]]
         even = np.abs(first - first[0] - np.arange(len(first)) / fs).max() <= _UNEVEN / fs
         if len(group) == 1 and (even or not whole[group[0]]):
-            clocks.append(_Clock(first, fs, bool(even)))
+            clocks.append(_Clock(first, fs))
         else:
             fs = float(f"{fs:.3g}")  # any rate will do, so a round one
-            low, high = max(own[i][0] for i in group), min(own[i][-1] for i in group)
-            clocks.append(_Clock(low + np.arange(int((high - low) * fs) + 1) / fs, fs, even=True))
+            clocks.append(_Clock(_common([own[i] for i in group], fs), fs))
             changed.append(number_of_group)
         place |= dict.fromkeys(group, number_of_group)
     return clocks, [place[i] for i in number], changed
+
+
+def _common(times: Sequence[Array], fs: float) -> Array:
+    """An even grid where all of the clocks run."""
+    low, high = max(t[0] for t in times), min(t[-1] for t in times)
+    if not (high - low) * fs >= 1.0:
+        raise InputError("the channels have no common stretch of time; give their files apart.")
+    return low + np.arange(int((high - low) * fs + 1e-6) + 1) / fs
+
+
+def _together(t: Array, other: Array) -> bool:
+    """Whether two clocks run at the same time for the most part."""
+    common = min(t[-1], other[-1]) - max(t[0], other[0])
+    return bool(common >= _LONG * max(t[-1] - t[0], other[-1] - other[0]))
 
 
 def _gapless(t: Array, fs: float) -> bool:

@@ -49,8 +49,6 @@ class TensorBoard:
         self.folder, self.finalist, self._say = Path(folder), finalist, say
         self.record, self.y_linear, self.every = record, y_linear, every
         self._writer: SummaryWriter | None = None
-        self.follows = False
-        """Whether iterations of a fit are written."""
         self._failed = False
         self._waiting: list[tuple[Progress, float]] = []
 
@@ -61,7 +59,6 @@ class TensorBoard:
 
     def history(self, history: Sequence[Progress]) -> None:
         """Log iterations of the past."""
-        self.follows = True
         for progress in history:
             self._write(progress.iteration, lambda writer, one=progress: _add(writer, one))
 

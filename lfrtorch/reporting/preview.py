@@ -41,7 +41,9 @@ class Preview:
             textwrap.fill(note, 100, initial_indent="- ", subsequent_indent="  ")
             for note in self.notes
         ]
-        return "\n".join([str(self.survey), "", *(said or ["Nothing found that would hurt."])])
+        return "\n".join(
+            [str(self.survey), "", *(said or ["Nothing found that would hurt a model."])]
+        )
 
 
 @typed()
@@ -71,5 +73,5 @@ def preview(record: Record) -> Preview:
             trial = None
         if trial is not None and trial.chosen == "estimated":
             notes.append(f"{trial}, and the record has start 'zero'")
-    title = record.name
-    return Preview(survey, tuple(notes), survey_figure(survey, np.hstack([record.u, y]), title))
+    figure = survey_figure(survey, np.hstack([record.u, y]), record.name)
+    return Preview(survey, tuple(notes), figure)

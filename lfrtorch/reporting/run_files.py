@@ -46,7 +46,6 @@ def write(
     if not board.begun:
         for earlier in folder.glob("events.out.tfevents.*"):
             earlier.unlink()
-    if not board.follows:
         board.history(result.history)
     texts = {
         "report": "\n\n".join(map(str, [run.verdict, *run.advice])),

@@ -57,12 +57,17 @@ def test_rows_that_only_count_need_a_rate():
 def test_what_is_wrong_with_a_frame_is_said():
     with pytest.raises(InputError, match=r"0.22 s before row 200, and 0.02 s usually; resample it"):
         Record.from_frame(frame(index=STAMPS).drop(STAMPS[200:210]), "force", "disp")
-    with pytest.raises(InputError, match="inputs is 'power'; give names of columns"):
+    with pytest.raises(InputError, match="the frame has no column 'power', of the inputs; it has"):
         Record.from_frame(frame(index=STAMPS), "power", "disp")
     with pytest.raises(InputError, match="the column 'note' has no numbers"):
         Record.from_frame(frame(index=STAMPS), "force", "note")
     with pytest.raises(InputError, match="fs is 10 Hz and the frame's index says 50 Hz"):
         Record.from_frame(frame(index=STAMPS), "force", "disp", 10.0)
+    twice = pd.concat([frame(index=STAMPS)] * 2, axis=1)
+    with pytest.raises(InputError, match=r"the frame has 2 columns 'force \(N\)', of the inputs"):
+        Record.from_frame(twice, "force (N)", "disp/mm")
+    with pytest.raises(InputError, match="index is no time; give fs=HZ"):
+        Record.from_frame(frame(index=STAMPS).iloc[:0], "force", "disp")
     with pytest.raises(InputError, match="give a pandas DataFrame"):
         Record.from_frame(U, "force", "disp")
     with pytest.raises(InputError, match=r"DataFrame; lfrtorch.load_records\(df, inputs"):
@@ -87,7 +92,7 @@ def test_a_model_simulates_a_frame():
     assert list(found.columns) == ["y1", "y2"]
     assert found.index.equals(STAMPS)
     np.testing.assert_array_equal(found.to_numpy(), model.simulate(u))
-    with pytest.raises(InputError, match="no column 'u1', an input of the model"):
+    with pytest.raises(InputError, match="no column 'u1', of the model's inputs"):
         model.simulate(inputs.drop(columns="u1"))
     with pytest.raises(InputError, match="fs is 50 Hz and the frame's index says 25 Hz"):
         model.simulate(inputs.iloc[::2])

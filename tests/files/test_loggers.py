@@ -185,6 +185,25 @@ def test_damaged_files_and_missing_packages(tmp_path: Path, monkeypatch, name: s
         open_table(tmp_path / name)
 
 
+def test_a_channel_that_lasts_a_short_time_does_not_cut_the_others():
+    found = {
+        "u": Series(TIMES, U),
+        "y": Series(TIMES + 1e-3, Y),
+        "event": Series(TIMES[300:340] + 2e-3, Y[300:340]),
+        "time": Series(TIMES, TIMES),
+    }
+    table = SeriesTable(Path("a.mf4"), Path("a.mf4"), found)
+    u, y, event, time = (table.find(n, "inputs")[0] for n in ("u", "y", "event", "channel time"))
+    (block,) = table.blocks([u, y, time])
+    assert len(block) == T - 1
+    with pytest.raises(InputError, match=r"for one clock write 'a\.mf4#100Hz'"):
+        next(table.blocks([u, event]))
+    slow = SeriesTable(Path("a.mf4#50Hz"), Path("a.mf4"), found)
+    (block,) = slow.blocks([slow.find(n, "inputs")[0] for n in ("u", "event")])
+    assert len(block) == T // 2
+    assert np.isfinite(block).sum(axis=0).tolist() == [T // 2, 19]
+
+
 def test_gaps_stay_gaps():
     t = np.delete(TIMES, slice(200, 260))
     table = SeriesTable(Path("a"), Path("a"), {"u": Series(t, t), "y": Series(t, 2 * t)})

@@ -22,7 +22,7 @@ def test_it_has_what_the_command_shows_of_a_file():
     record = lfrtorch.Record(u, y, fs=50.0)
     good = lfrtorch.preview(record)
     assert good.notes == ()
-    assert str(good).endswith("Nothing found that would hurt.")
+    assert str(good).endswith("Nothing found that would hurt a model.")
     assert good.figure.axes[-3].get_xlabel().startswith("time")
     valid = np.ones((2000, 1), dtype=bool)
     valid[100:120] = False
