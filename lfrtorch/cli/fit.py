@@ -136,7 +136,7 @@ class _Folder(Console):
             TensorBoard(self.folder / STARTS / f"{i:02d}", finalist=True, say=self.note)
             for i in range(len(models))
         ]
-        own = zip(printing, self._boards, strict=True)
+        own = list(zip(printing, self._boards, strict=True))
         rounds = TensorBoard(self.folder / STARTS, say=self.note)
         self._boards.append(rounds)
 
