@@ -81,8 +81,8 @@ class Dataset:
 
     name: str
     train: list[Record]
-    validation: list[Record]
-    tests: list[Record]
+    validation: list[Record] = field(default_factory=list)
+    tests: list[Record] = field(default_factory=list)
     noise_rms: float | None = None
     published: tuple[Published, ...] = field(default_factory=tuple)
     selection: list[Record] = field(default_factory=list)

@@ -8,6 +8,7 @@ simulation from rest.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -18,7 +19,7 @@ from lfrtorch.engine.linear_recurrence import linear_recurrence
 from lfrtorch.engine.linearised import linearise
 from lfrtorch.engine.simulation import Trajectory, simulate, simulate_near
 
-ITERATIONS, _HALVINGS, _TOLERANCE = 20, 6, 1e-10
+ITERATIONS, _HALVINGS, _TOLERANCE = 20, 6, 1e-8
 """Most Gauss-Newton steps, trials in a step, and the relative decrease that ends the search."""
 
 _SEEN = 1e-9
@@ -73,7 +74,7 @@ def start_from_beginning(
         found = simulate_near(cell, u, begun, best)
         better = squares(found) < _FAR_BETTER * squares(best)
         if better.any():
-            found = _fitted_start(cell, u, y, weight, u.new_zeros(len(u), cell.nx, cell.nx), found)
+            found = _fitted_start(cell, u, y, weight, found)
             pairs = zip(found, best, strict=True)
             best = Trajectory(*(torch.where(better[:, None, None], a, b) for a, b in pairs))
         T //= 2
@@ -105,6 +106,7 @@ def estimated_start(
     u: Float[Tensor, "R T nu"],
     y: Float[Tensor, "R T ny"],
     weight: Float[Tensor, "R T ny"],
+    near: Float[Tensor, "R nx"] | None = None,
 ) -> Float[Tensor, "R nx"]:
     """The most probable initial state, given the output and the factors of its errors.
 
@@ -114,7 +116,8 @@ def estimated_start(
     squares is taken if it is far better, as a system may begin far from where the training data
     have been, or if the prior makes no difference, as with far more samples than states. From a
     state after which the model runs away, though it does not from rest, the simulation begins at
-    rest instead.
+    rest instead. ``near`` is the state of a model close to this one: the search begins there, if
+    its errors are less than those from rest.
     """
     R, nx = len(u), cell.nx
     counted = (weight != 0).sum(dim=(1, 2))
@@ -131,18 +134,20 @@ def estimated_start(
     def squares(found: Trajectory) -> Tensor:
         return (weight * (found.y - y)).square().sum(dim=(1, 2))
 
-    free = _fitted_start(cell, u, y, weight, u.new_zeros(R, nx, nx), rest)
+    first = rest
+    if near is not None:
+        there = simulate(cell, u, near)
+        closer = (squares(there) < squares(rest))[:, None, None]  # False for NaN
+        pairs = zip(there, rest, strict=True)
+        first = Trajectory(*(torch.where(closer, a, b) for a, b in pairs))
+    free = _fitted_start(cell, u, y, weight, first)
     stayed = ~free.x[:, 0].any(dim=1)  # Gauss-Newton may fail on many states
     odd = (white @ free.x[:, 0].unsqueeze(-1)).square().sum(dim=(1, 2))
     if not (known & (stayed | (odd > _ODD * counted))).any():
         return _staying(cell, whole, free.x, white)
-    probable = rest
-    for _ in range(PASSES):
-        variance = squares(probable).nan_to_num(0.0, 0.0) / counted.clamp_min(1)
-        prior = white * variance.sqrt()[:, None, None]
-        last, probable = probable, _fitted_start(cell, u, y, weight, prior, probable)
-        if torch.equal(probable.x[:, 0], last.x[:, 0]):
-            break  # all passes that follow would find the same
+    variance = squares(rest).nan_to_num(0.0, 0.0) / counted.clamp_min(1)
+    prior = _Prior(white, variance, counted)
+    probable = _fitted_start(cell, u, y, weight, first, prior, settled=near is not None)
     lost = ~torch.isfinite(squares(probable))
     better = ~known | lost | ((squares(free) < _FAR * squares(probable)) & (counted > 2 * nx))
     found = torch.where(better[:, None, None], free.x, probable.x)
@@ -185,39 +190,79 @@ def state_moments(cell: LFRCell, u: Float[Tensor, "R T nu"]) -> Float[Tensor, "R
     return x.mT @ x / x.shape[1]
 
 
+class _Prior(NamedTuple):
+    """v |white x0|² beside the squared errors: v is their variance, and is found with x0."""
+
+    white: Float[Tensor, "R nx nx"]
+    variance: Float[Tensor, " R"]  # at rest: the largest
+    counted: Float[Tensor, " R"]  # errors
+
+    def weight(
+        self,
+        passes: int,
+        rows: Float[Tensor, "R n nx"],
+        errors: Float[Tensor, "R n 1"],
+        x0: Float[Tensor, "R nx"],
+    ) -> Float[Tensor, " R"]:
+        """v after so many passes, each with the states that the linear model has at the last v."""
+        variance = self.variance
+        if passes == 1:
+            return variance
+        U, S, _ = torch.linalg.svd(rows @ torch.linalg.pinv(self.white), full_matrices=False)
+        errors = errors - rows @ x0.unsqueeze(-1)
+        along = (U.mT @ errors).squeeze(-1)
+        beside = (errors.square().sum(dim=(1, 2)) - along.square().sum(dim=1)).clamp_min(0.0)
+        for _ in range(passes - 1):
+            v = variance.unsqueeze(1)
+            left = torch.where(v > 0, along * v / (S.square() + v), 0.0)
+            variance = (left.square().sum(dim=1) + beside) / self.counted.clamp_min(1)
+        return variance
+
+
 def _fitted_start(
     cell: LFRCell,
     u: Float[Tensor, "R T nu"],
     y: Float[Tensor, "R T ny"],
     weight: Float[Tensor, "R T ny"],
-    prior: Float[Tensor, "R nx nx"],
     best: Trajectory,
+    prior: _Prior | None = None,
+    *,
+    settled: bool = False,
 ) -> Trajectory:
-    """Trajectory from the initial state that minimises |weight (y_hat - y)|² + |prior x0|².
+    """Trajectory from the initial state that minimises |weight (y_hat - y)|², and the prior.
 
-    Gauss-Newton from ``best``; a step that does not lower the cost is quartered.
+    Gauss-Newton from ``best``; a step that does not lower the cost is quartered. The prior's weight
+    comes down from its largest in the first steps, unless the search begins ``settled``.
     """
+    x0, v = best.x[:, 0].clone(), u.new_zeros(len(u))
+    white = u.new_zeros(len(u), 0, cell.nx) if prior is None else prior.white
+    seen = _SEEN * weight.abs().amax()
 
     def squares(trajectory: Trajectory, x0: Tensor) -> Tensor:
         errors = (weight * (trajectory.y - y)).square().sum(dim=(1, 2))
-        return errors + (prior @ x0.unsqueeze(-1)).square().sum(dim=(1, 2))
+        return errors + v * (white @ x0.unsqueeze(-1)).square().sum(dim=(1, 2))
 
-    x0 = best.x[:, 0].clone()
-    cost = squares(best, x0)
-    seen = _SEEN * weight.abs().amax()
-    for _ in range(ITERATIONS):
-        rows, errors = _factor(cell, weight, weight * (best.y - y), prior, best)
-        usable = torch.isfinite(rows).all(dim=(1, 2)) & torch.isfinite(cost)
+    for k in range(ITERATIONS):
+        rows, errors = _factor(cell, weight, weight * (best.y - y), best)
+        passes = PASSES if prior is None or settled else min(2**k, PASSES)
+        usable = torch.isfinite(rows).all(dim=(1, 2))
         rows, errors = (torch.where(usable[:, None, None], t, 0.0) for t in (rows, errors))
+        if prior is not None:
+            v = prior.weight(passes, rows, errors, x0)
+            scaled = white * v.sqrt()[:, None, None]
+            rows = torch.cat([rows, scaled], dim=1)
+            errors = torch.cat([errors, scaled @ x0.unsqueeze(-1)], dim=1)
+        cost = before = squares(best, x0)
         # A state that the output does not show stays where it is.
         step = -(torch.linalg.pinv(rows, atol=seen, rtol=_SEEN) @ errors).squeeze(-1)
-        before = cost
-        # A step that should lower the cost by less than its rounding is not worth a trial.
+        # A step that should hardly lower the cost is not worth a trial.
         promised = (rows @ step.unsqueeze(-1)).square().sum(dim=(1, 2))
-        waiting = usable & (promised > torch.finfo(cost.dtype).eps * cost)
-        if not waiting.any():
+        waiting = usable & torch.isfinite(cost) & (promised > _TOLERANCE * cost)
+        if passes == PASSES and not waiting.any():
             break
         for _ in range(_HALVINGS):
+            if not waiting.any():
+                break
             trial = simulate_near(cell, u, x0 + step, best)
             trial_cost = squares(trial, x0 + step)
             better = waiting & (trial_cost < cost)  # False for NaN
@@ -226,10 +271,8 @@ def _fitted_start(
             pairs = zip(trial, best, strict=True)
             best = Trajectory(*(torch.where(better[:, None, None], t, b) for t, b in pairs))
             waiting &= ~better
-            if not waiting.any():
-                break
             step = step / 4
-        if not (cost < (1.0 - _TOLERANCE) * before).any():
+        if passes == PASSES and not (cost < (1.0 - _TOLERANCE) * before).any():
             break
     return best
 
@@ -238,16 +281,15 @@ def _factor(
     cell: LFRCell,
     weight: Float[Tensor, "R T ny"],
     errors: Float[Tensor, "R T ny"],
-    prior: Float[Tensor, "R nx nx"],
     at: Trajectory,
 ) -> tuple[Float[Tensor, "R n nx"], Float[Tensor, "R n 1"]]:
-    """R of the QR of [derivative by x0 | errors], weighted, with the rows of the prior.
+    """R of the QR of [derivative by x0 | errors], weighted.
 
     dy(k)/dx0 = H(k) Φ(k) with Φ(k+1) = F(k) Φ(k), Φ(0) = I.
     """
     R, T, _ = weight.shape
     Phi = torch.eye(cell.nx).to(weight).expand(R, -1, -1)
-    folded = torch.cat([prior, prior @ at.x[:, 0].unsqueeze(-1)], dim=2)
+    folded = Phi.new_zeros(R, 0, cell.nx + 1)
     length = max(1, BLOCK // R)
     for k in range(0, T, length):
         block = slice(k, k + length)

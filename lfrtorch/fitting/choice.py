@@ -40,7 +40,7 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError, LfrtorchError, brief
 from lfrtorch._support.tables import percent, quantity
-from lfrtorch._support.threads import each_alone
+from lfrtorch._support.threads import each_alone, worth_threads
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.distributed import Ranks
@@ -491,7 +491,7 @@ class _Study:
     def _alone(self, work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
         """Do the work of each item on a thread; Ctrl-C ends all."""
         try:
-            return each_alone(work, items, self._halt)
+            return each_alone(work, items, self._halt, threads=worth_threads(self.rows))
         except KeyboardInterrupt:
             raise StoppedError("stopped while sizes were chosen") from None
 

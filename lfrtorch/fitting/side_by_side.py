@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from threading import Event, Lock
 
 from lfrtorch._support.reasons import Reason
-from lfrtorch._support.threads import each_alone
+from lfrtorch._support.threads import each_alone, worth_threads
 from lfrtorch.fitting.trainer import Fit, Monitor, Progress, Stop
 from lfrtorch.model import Model
 
@@ -33,7 +33,9 @@ class Together:
     def advance(self, fits: Sequence[Fit], until: int) -> None:
         """Go on with some of them to an iteration."""
         first = fits[0]
-        on_threads = first.ranks.world == 1 and first.problem.theta.device.type == "cpu"
+        theta = first.problem.theta
+        on_threads = first.ranks.world == 1 and theta.device.type == "cpu"
+        on_threads &= worth_threads(first.problem.size, len(theta))
         try:
             if len(fits) > 1 and on_threads:
                 each_alone(lambda fit: self._advance_one(fit, until), fits, self._halt.set)

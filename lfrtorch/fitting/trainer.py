@@ -368,6 +368,9 @@ class Fit:
         state, tensors = state_file.packed(self.state)
         problem = self.problem.state_dict()
         tensors |= {f"problem.{name}": tensor for name, tensor in problem.items()}
+        if self.judge is not None:
+            judge = self.judge.state_dict()
+            tensors |= {f"judge.{name}": tensor for name, tensor in judge.items()}
         numbers = {
             "state": state,
             "history": [asdict(progress) for progress in self.history],
@@ -386,6 +389,8 @@ class Fit:
         if self.ranks.world > 1:  # what was kept of the terms is the first process's part
             kept = {name: part for name, part in kept.items() if "." not in name}
         self.problem.load_state_dict(kept)
+        if self.judge is not None:
+            self.judge.load_state_dict(state_file.within("judge.", tensors))
         try:
             state = state_file.unpacked(like, numbers["state"], tensors)
         except TypeError:

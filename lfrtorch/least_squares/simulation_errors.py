@@ -82,6 +82,8 @@ class SimulationErrors:
         self._memory = Memory()
         self._guesses: list[Tensor | None] = [None] * len(self.groups)
         """States of each group at a θ close to the next one."""
+        self._starts: list[Tensor | None] = [None] * len(self.groups)
+        """Initial states of each group that were solved for last."""
         # A search evaluates r at a θ and, if it accepts it, J there: one simulation serves both.
         self._latest: tuple[Tensor, list[Trajectory]] | None = None
 
@@ -146,7 +148,10 @@ class SimulationErrors:
             return group.x0
         if self._solved:
             assert group.start_weight is not None
-            return estimated_start(self.cell_at(theta), group.u, group.y, group.start_weight)
+            cell, near = self.cell_at(theta), self._starts[i]
+            found = estimated_start(cell, group.u, group.y, group.start_weight, near)
+            self._starts[i] = found
+            return found
         return self.parameters.initial_states(theta)[group.estimated]
 
     def first_initial_states(self) -> Float[Tensor, "states nx"]:
@@ -172,11 +177,13 @@ class SimulationErrors:
             if guess is not None:  # machine code needs the initial state of a period alone
                 compiled = is_compiled(self._cell, group.u)
                 tensors[f"guess.{i}"] = guess[:, :1] if compiled else guess
+        tensors |= {f"solved.{i}": x for i, x in enumerate(self._starts) if x is not None}
         return tensors
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Take over what the same term had."""
         self._guesses = [tensors.get(f"guess.{i}") for i in range(len(self.groups))]
+        self._starts = [tensors.get(f"solved.{i}") for i in range(len(self.groups))]
         self._latest = None
 
 
