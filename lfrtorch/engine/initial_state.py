@@ -146,7 +146,7 @@ def estimated_start(
     if not (known & (stayed | (odd > _ODD * counted))).any():
         return _staying(cell, whole, free.x, white)
     variance = squares(rest).nan_to_num(0.0, 0.0) / counted.clamp_min(1)
-    prior = _Prior(white, variance, counted)
+    prior = _Prior(white, axes * moments.sqrt().unsqueeze(-2), variance, counted)
     probable = _fitted_start(cell, u, y, weight, first, prior, settled=near is not None)
     lost = ~torch.isfinite(squares(probable))
     better = ~known | lost | ((squares(free) < _FAR * squares(probable)) & (counted > 2 * nx))
@@ -194,6 +194,7 @@ class _Prior(NamedTuple):
     """v |white x0|² beside the squared errors: v is their variance, and is found with x0."""
 
     white: Float[Tensor, "R nx nx"]
+    spread: Float[Tensor, "R nx nx"]  # its inverse
     variance: Float[Tensor, " R"]  # at rest: the largest
     counted: Float[Tensor, " R"]  # errors
 
@@ -208,7 +209,7 @@ class _Prior(NamedTuple):
         variance = self.variance
         if passes == 1:
             return variance
-        U, S, _ = torch.linalg.svd(rows @ torch.linalg.pinv(self.white), full_matrices=False)
+        U, S, _ = torch.linalg.svd(rows @ self.spread, full_matrices=False)
         errors = errors - rows @ x0.unsqueeze(-1)
         along = (U.mT @ errors).squeeze(-1)
         beside = (errors.square().sum(dim=(1, 2)) - along.square().sum(dim=1)).clamp_min(0.0)
@@ -237,6 +238,7 @@ def _fitted_start(
     x0, v = best.x[:, 0].clone(), u.new_zeros(len(u))
     white = u.new_zeros(len(u), 0, cell.nx) if prior is None else prior.white
     seen = _SEEN * weight.abs().amax()
+    tolerance = max(_TOLERANCE, torch.finfo(u.dtype).eps)
 
     def squares(trajectory: Trajectory, x0: Tensor) -> Tensor:
         errors = (weight * (trajectory.y - y)).square().sum(dim=(1, 2))
@@ -257,7 +259,7 @@ def _fitted_start(
         step = -(torch.linalg.pinv(rows, atol=seen, rtol=_SEEN) @ errors).squeeze(-1)
         # A step that should hardly lower the cost is not worth a trial.
         promised = (rows @ step.unsqueeze(-1)).square().sum(dim=(1, 2))
-        waiting = usable & torch.isfinite(cost) & (promised > _TOLERANCE * cost)
+        waiting = usable & torch.isfinite(cost) & (promised > tolerance * cost)
         if passes == PASSES and not waiting.any():
             break
         for _ in range(_HALVINGS):

@@ -39,9 +39,27 @@ def test_a_linear_model_is_not_simulated_from_states_that_cannot_be_better(monke
         initial_state, "simulate_near", lambda *given: tried.append(1) or simulate_near(*given)
     )
     simulate_estimated(cell, u, y, torch.ones_like(y))
-    # From rest, one step, and one of its rounding errors at most; a few in each further pass.
-    # Before it was looked whether a step promises anything, six halvings of each followed.
-    assert len(tried) <= 3 * (1 + initial_state.PASSES)
+    # From rest, one step each, and one for each weight of the prior on its way down.
+    assert len(tried) <= 6
+
+
+def test_the_search_from_the_state_of_a_model_close_by_is_short_and_ends_at_the_same(monkeypatch):
+    cell, u = random_cell(1, 1, 3, 2, 2, 4), normal(2, 60, 1)
+    y = simulate(cell, u, normal(2, 3, seed=1)).y + 0.1 * normal(2, 60, 1, seed=2)
+    weight, factors, factor = torch.ones_like(y), [], initial_state._factor
+    near = estimated_start(cell, u, y, weight)
+    with torch.no_grad():
+        for parameter in cell.parameters():
+            parameter.mul_(1.0 + 1e-4)
+    monkeypatch.setattr(
+        initial_state, "_factor", lambda *given: factors.append(1) or factor(*given)
+    )
+    whole = estimated_start(cell, u, y, weight)
+    searched = len(factors)
+    assert_close(estimated_start(cell, u, y, weight, near), whole, rtol=0, atol=1e-4)
+    assert len(factors) - searched < 0.6 * searched
+    # One that is no use is not begun at.
+    assert torch.equal(estimated_start(cell, u, y, weight, torch.full_like(near, torch.nan)), whole)
 
 
 @pytest.mark.parametrize("counted", [20, 3000])
