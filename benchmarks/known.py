@@ -157,7 +157,7 @@ def speed() -> None:
     for name, model in (("network alone", network), ("known and network", both), ("known", grey)):
         measured[name] = iteration(model, record)
     both.lfr.to(dtype=torch.float32)
-    measured["known and network, in float32: by torch"] = iteration(both, record)
+    measured["known and network, in float32"] = iteration(both, record)
     print("| static map | ms an iteration | times the network's |\n" + "|---" * 3 + "|")
     for name, seconds in measured.items():
         print(f"| {name} | {1e3 * seconds:.3g} | {seconds / measured['network alone']:.2f} |")

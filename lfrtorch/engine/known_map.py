@@ -9,13 +9,14 @@ import copy
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Module, Parameter
 
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.threads import has_kernels, spread, to_numpy, workers
+from lfrtorch._support.threads import has_kernels, spread, to_float64, workers
 from lfrtorch.engine.formula_code import machine_code
 from lfrtorch.engine.known_kernel import DISCRETE, EULER, RK4, known_slopes
 from lfrtorch.engine.operations import Formula, Symbol
@@ -188,11 +189,11 @@ class KnownMap(Module):
     def arguments(self, p: Tensor | None = None) -> list[Any]:
         """Scaling and physical parameters as ``known_kernel`` takes them."""
         own = self.p if p is None else p
-        return [to_numpy(self.of_z), to_numpy(self.of_w), to_numpy(own * self.p_scale)]
+        return [to_float64(each) for each in (self.of_z, self.of_w, own * self.p_scale)]
 
     def linearised(self, z: Float[Tensor, "R T nz"], weights: Weights) -> StaticJacobian:
         """The map linearised at z, with the given weights."""
-        if not (has_kernels(z) and z.dtype == torch.float64):
+        if not has_kernels(z):
             return ModuleJacobian(self, z, weights)
         return KnownJacobian(self, z, weights["p"])
 
@@ -205,15 +206,17 @@ class KnownMap(Module):
 class KnownJacobian:
     """A known model in machine code: derivatives of one step, exact through the integration."""
 
+    # The code is that of float64, for float32 as well.
+
     def __init__(self, of: KnownMap, z: Float[Tensor, "R T nz"], p: Float[Tensor, " p"]) -> None:
         R, T = z.shape[:2]
-        self.J = z.new_empty(R, T, of.nw, of.nz)
-        self._by_p = z.new_empty(R, T, of.nw, len(p))
-        scaling = [*of.arguments(p), to_numpy(of.p_scale)]
-        outputs = self.J.numpy(), self._by_p.numpy()
+        J, by_p = np.empty((R, T, of.nw, of.nz)), np.empty((R, T, of.nw, len(p)))
+        scaling = [*of.arguments(p), to_float64(of.p_scale)]
         parts = min(R, workers())
         formulas = of.kernel(slopes=True)
-        spread(known_slopes, parts, parts, to_numpy(z), *scaling, *formulas, *outputs)
+        states = np.ascontiguousarray(to_float64(z))
+        spread(known_slopes, parts, parts, states, *scaling, *formulas, J, by_p)
+        self.J, self._by_p = (torch.from_numpy(each).to(z.dtype) for each in (J, by_p))
 
     def part(self, records: slice, time: slice) -> StaticJacobian:
         """The same for some of the records and samples."""

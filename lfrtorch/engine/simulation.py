@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -179,9 +180,9 @@ def steady_state(
 def is_compiled(cell: LFRCell, u: Tensor) -> bool:
     """Whether machine code simulates the cell on the device of ``u``."""
     static = base_of(cell.static)
-    if known_parts(static) is not None and static is cell.static:
-        return has_kernels(u) and u.dtype == torch.float64
-    return (static is None or known(static) is not None) and has_kernels(u)
+    in_code = static is None or known(static) is not None
+    in_code |= known_parts(static) is not None and static is cell.static
+    return in_code and has_kernels(u)
 
 
 @torch.no_grad()
@@ -240,9 +241,15 @@ def _compiled(
     out = [signal.numpy() for signal in near]
     if (parts := known_parts(cell.static)) is not None:
         model, learned = parts
-        weights = [*kernel_arguments(cell, learned), *model.arguments(), *model.kernel()]
-        parts = min(R, workers())
-        spread(simulate_known_records, parts, parts, to_numpy(u), *weights, met_within, *out)
+        # The code of equations is that of float64, for float32 as well.
+        given = [to_numpy(u), *kernel_arguments(cell, learned)]
+        given = [a.astype(float) if getattr(a, "dtype", None) == np.float32 else a for a in given]
+        doubles, parts = [np.asarray(signal, np.float64) for signal in out], min(R, workers())
+        weights = [*given, *model.arguments(), *model.kernel()]
+        spread(simulate_known_records, parts, parts, *weights, met_within, *doubles)
+        for signal, found in zip(out, doubles, strict=True):
+            if found is not signal:
+                signal[:] = found
         return near
     spread(simulate_record, R, to_numpy(u), *kernel_arguments(simulated), met_within, *out)
     return near if simulated is cell else signals(cell, u, near.x)

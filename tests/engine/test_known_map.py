@@ -148,3 +148,22 @@ def test_a_centred_hold_is_that_of_the_middle_of_samples():
         errors.append(float((y - steady)[200:].abs().max()))
     assert errors[0] > 0.05
     assert errors[1] < 0.003
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_float32_runs_in_the_same_machine_code(method: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(simulation, "newton_states", None)  # what torch would do
+    monkeypatch.setattr(ModuleJacobian, "__init__", None)
+    for cell in cells(method):
+        u, x0 = signals(cell)
+        exact = simulation.simulate(cell, u, x0)
+        J, *_ = output_jacobian(Linearisation(cell, u, exact))
+        rounded = cell.to(torch.float32)
+        u, x0 = u.float(), x0.float()
+        found = simulation.simulate(rounded, u, x0)
+        assert found.y.dtype == torch.float32
+        assert_close(found.y.double(), exact.y, rtol=1e-4, atol=1e-4)
+        again = simulation.simulate_near(rounded, u, x0, found)
+        assert_close(again.y, found.y)
+        own, *_ = output_jacobian(Linearisation(rounded, u, found))
+        assert_close(own.double(), J, rtol=1e-3, atol=1e-3 * float(J.abs().max()))
