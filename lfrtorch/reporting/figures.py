@@ -1,4 +1,4 @@
-"""The figures of a run: outputs and errors, the static map, convergence, the linear model."""
+"""The figures of a run: outputs, errors, static map, steps, convergence, the linear model."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from lfrtorch.records import Record, common_unit
 from lfrtorch.reporting import linear_plots, plots
 from lfrtorch.reporting.evaluation import Response, ranked
 from lfrtorch.reporting.run import Run
+from lfrtorch.reporting.step_plots import steps
 
 MOST_OUTPUTS, MOST_RECORDS = 4, 4
 """Outputs in one figure, and records of which the report has all views."""
@@ -32,6 +33,8 @@ def of_run(run: Run) -> tuple[dict[str, Figure], Views]:
     drawn, views = of_records(run.simulations, dataset)
     with suppress(InputError):  # a linear model, or one that diverges
         drawn["static_map"] = static_figure(model, dataset.train[0])
+    with suppress(InputError):  # no rest
+        drawn["steps"] = steps(model, bla, dataset.train)
     unit = common_unit(model.outputs)
     drawn["convergence"] = plots.convergence(run.fit.history, run.fit.chosen_iteration, unit)
     drawn["frequency_response"] = linear_plots.frequency_response(bla, _measured(dataset.train))
