@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from threading import Event, Lock
 
 from lfrtorch._support.reasons import Reason
@@ -34,11 +35,12 @@ class Together:
         """Go on with some of them to an iteration."""
         first = fits[0]
         theta = first.problem.theta
-        on_threads = first.ranks.world == 1 and theta.device.type == "cpu"
-        on_threads &= worth_threads(first.problem.size, len(theta))
+        threads = worth_threads(first.problem.size, len(theta))
+        alone = first.ranks.world == 1 and theta.device.type == "cpu"
         try:
-            if len(fits) > 1 and on_threads:
-                each_alone(lambda fit: self._advance_one(fit, until), fits, self._halt.set)
+            if len(fits) > 1 and alone:
+                advance = partial(self._advance_one, until=until)
+                each_alone(advance, fits, self._halt.set, threads=threads)
             else:
                 for fit in fits:
                     self._advance_one(fit, until)
@@ -51,6 +53,8 @@ class Together:
     def _advance_one(self, fit: Fit, until: int) -> None:
         if fit.history or not fit.stopped():
             fit.advance(until, self._monitors[id(fit)])
+        if fit.reason == Reason.INTERRUPTED:
+            self._halt.set()  # Ctrl-C is for those as well that wait for their turn
 
     def _in_turn(self, monitor: Monitor) -> Monitor:
         def call(model: Model, progress: Progress) -> None:

@@ -14,8 +14,10 @@ from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
 from lfrtorch._support.reasons import Reason
+from lfrtorch._support.threads import worth_threads
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import Polynomial
+from lfrtorch.fitting import side_by_side
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import Round, fit, iterations_of, schedule
 from lfrtorch.fitting.snapshots import Snapshots
@@ -235,6 +237,41 @@ def test_ctrl_c_keeps_the_best_of_all(threads: int):
     score, weights = min(best.values(), key=lambda each: each[0])
     assert torch.equal(unscaled(result.model), weights)
     assert result.history[result.chosen_iteration].score == score
+
+
+def test_ctrl_c_in_one_of_small_fits_ends_those_that_wait():
+    models, train, validation = several(3)
+    begun = []
+
+    def watch(model: Model, progress: Progress):
+        begun.append(id(model))
+        if progress.iteration == 1:
+            raise KeyboardInterrupt
+
+    result = fit(models, train, validation, monitors=[[watch]] * 3)
+    assert result.reason == Reason.INTERRUPTED
+    assert set(begun) == {id(models[0])}
+
+
+def test_small_fits_do_not_wait_for_each_other_on_threads(monkeypatch: pytest.MonkeyPatch):
+    models, train, validation = several(3)
+    seen = set()
+
+    def watch(model: Model, progress: Progress):
+        seen.add(threading.get_ident())
+
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        for worth in (False, True):
+            monkeypatch.setattr(side_by_side, "worth_threads", lambda *_, worth=worth: worth)
+            seen.clear()
+            fit(models, train, validation, monitors=[[watch]] * 3)
+            assert (threading.get_ident() in seen) == (not worth)
+    finally:
+        torch.set_num_threads(before)
+    assert not worth_threads(240, 90)
+    assert worth_threads(100_000, 90)
 
 
 def test_a_stop_after_some_have_come_to_the_end_of_their_round():
