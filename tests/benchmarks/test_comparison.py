@@ -1,0 +1,82 @@
+"""The comparison with other packages: what a script gets, what is kept of it, the page."""
+
+import argparse
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
+sys.path.append(str(FOLDER))
+import comparison  # noqa: E402
+
+
+@pytest.fixture
+def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> argparse.Namespace:
+    """Records of 400 samples, scripts in a folder of their own, three seconds for each."""
+    monkeypatch.setattr(comparison, "SCRIPTS", tmp_path)
+    monkeypatch.setattr(comparison, "SECONDS", 3.0)
+    monkeypatch.setattr(comparison, "GRACE", 1.0)
+    (tmp_path / "given.py").write_text((FOLDER / "contestants" / "given.py").read_text())
+    (tmp_path / "two_tanks").mkdir()
+    u = np.random.default_rng(0).standard_normal(400)
+    table = np.column_stack([u, 2.0 * u])
+    np.savetxt(
+        tmp_path / "two_tanks/train.csv", table, delimiter=",", header="pump,level", comments=""
+    )
+    return argparse.Namespace(root=None, wild=tmp_path, peers=Path(sys.prefix))
+
+
+def ended(options: argparse.Namespace, text: str) -> dict:
+    (options.wild / "mine.py").write_text(f'"""A script of mine."""\n\n{text}\n')
+    return comparison.run("two_tanks", "mine", options)
+
+
+def test_the_error_is_that_of_the_last_quarter(options: argparse.Namespace):
+    wrong = "from given import every_u, keep, u, y\nassert len(u) == len(y) == 300\n"
+    wrong += "found = 2 * every_u\nfound[:300] = 7\nfound[300:] += 0.5\nkeep(found)"
+    found = ended(options, wrong)
+    assert found["rmse"] == pytest.approx(0.5)
+    assert found["nrmse"] == pytest.approx(0.25, rel=0.2)
+    assert 0 < found["seconds"] < 4
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("import time\ntime.sleep(9)", "not done in two minutes"),
+        ("raise ValueError('no')", "ValueError: no"),
+        ("pass", "no output"),
+        ("from given import every_u, keep\nkeep(every_u * float('nan'))", "diverges"),
+    ],
+)
+def test_a_script_that_fails_has_its_reason(options: argparse.Namespace, text: str, why: str):
+    assert why in ended(options, text)["failed"]
+
+
+def test_as_many_iterations_are_made_as_the_time_allows(
+    options: argparse.Namespace, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(comparison, "SECONDS", 14.0)  # ten are left for the simulation
+    counts = options.wild / "counts.txt"
+    text = "import time\nfrom given import affordable, every_u, keep\n"
+    text += "few = affordable(lambda n: time.sleep(0.05 * n), 1000)\n"
+    text += "many = affordable(lambda n: None, 1000)\nkeep(every_u)\n"
+    text += f"open({str(counts)!r}, 'w').write(f'{{few}} {{many}}')"
+    assert "failed" not in ended(options, text)
+    few, many = map(int, counts.read_text().split())
+    assert many == 1000
+    assert 10 < few < 80
+
+
+def test_the_page_has_the_table_of_the_results():
+    every = json.loads(comparison.RESULTS.read_text())
+    page = (FOLDER / "comparison.md").read_text()
+    assert comparison.table(every) in page
+    scripts = {path.stem for path in comparison.SCRIPTS.glob("*.py")} - {"given"}
+    assert scripts == {script for pair in comparison.CONTESTANTS.values() for script in pair}
+    assert {*every} == {*comparison.SYSTEMS}
+    assert re.search(r"no test record is used", page)
