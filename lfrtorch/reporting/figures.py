@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 
 from matplotlib.figure import Figure
 
 from lfrtorch._support.errors import InputError
+from lfrtorch.analysis.confidence_bands import Uncertainty, uncertainty
 from lfrtorch.analysis.model_plots import static_figure
 from lfrtorch.dataset import Dataset
+from lfrtorch.fitting.refit import all_records
 from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.records import Record, common_unit
 from lfrtorch.reporting import linear_plots, plots
@@ -20,6 +23,8 @@ from lfrtorch.reporting.step_plots import steps
 MOST_OUTPUTS, MOST_RECORDS = 4, 4
 """Outputs in one figure, and records of which the report has all views."""
 
+_MOST_WORK = 1e9
+"""Samples times squared parameters up to which the bands are drawn: a second or two."""
 
 Views = dict[str, dict[str, str]]
 """Captions by the names of records, then of figures."""
@@ -30,7 +35,7 @@ def of_run(run: Run) -> tuple[dict[str, Figure], Views]:
     # These are the tests; without tests validation, else training. The first has the largest error;
     # of a group that makes one score it is the only one.
     model, bla, dataset = run.fit.model, run.linear, run.dataset
-    drawn, views = of_records(run.simulations, dataset)
+    drawn, views = of_records(run.simulations, dataset, _uncertainty(run))
     with suppress(InputError):  # a linear model, or one that diverges
         drawn["static_map"] = static_figure(model, dataset.train[0])
     with suppress(InputError):  # no rest
@@ -44,7 +49,9 @@ def of_run(run: Run) -> tuple[dict[str, Figure], Views]:
     return drawn, views
 
 
-def of_records(simulated: Sequence[Response], dataset: Dataset) -> tuple[dict[str, Figure], Views]:
+def of_records(
+    simulated: Sequence[Response], dataset: Dataset, known: Uncertainty | None = None
+) -> tuple[dict[str, Figure], Views]:
     """Errors of all tests, and all views of the records with the largest errors."""
     largest: dict[str, Response] = {}
     for response in ranked(simulated):
@@ -54,7 +61,7 @@ def of_records(simulated: Sequence[Response], dataset: Dataset) -> tuple[dict[st
     views: Views = {}
     for response in shown[:MOST_RECORDS]:
         record = response.record
-        own, views[record.name] = of_record(record, response.simulated)
+        own, views[record.name] = of_record(record, response.simulated, known)
         drawn |= own
     for response in shown[MOST_RECORDS:]:
         if response.use == "test":
@@ -68,16 +75,22 @@ def of_records(simulated: Sequence[Response], dataset: Dataset) -> tuple[dict[st
 
 
 def of_record(
-    record: Record, simulated: plots.Simulated
+    record: Record, simulated: plots.Simulated, known: Uncertainty | None = None
 ) -> tuple[dict[str, Figure], dict[str, str]]:
     """All views of a record by file name, and captions of those of its first outputs."""
     name, ny = record.name, len(record.outputs)
     whole = plots.is_whole(record)
     spectrum = plots.spectrum if whole else plots.density
     of_spectrum = "Spectrum over whole periods." if whole else "Power spectral density."
+    of_near, band = "The grey stretch, about the largest error.", None
+    if known is not None:
+        band = known.simulate(record)
+        of_near += " Band: where 95 % of the errors are if noise and what the data leave open of "
+        of_near += "the parameters are all there is."
+        of_near += "".join(f" But {doubt.rstrip('.')}." for doubt in known.doubts[:1])
     views = (
         ("_response" * whole, plots.response, "Outputs and errors. Fit: 100 % − NRMSE."),
-        ("_near", plots.close_up, "The grey stretch, about the largest error."),
+        ("_near", partial(plots.close_up, band=band), of_near),
         ("_density" * (not whole), spectrum, of_spectrum),
         ("_distribution", plots.distribution, "How often which error occurs."),
     )
@@ -91,6 +104,21 @@ def of_record(
             if not first:
                 captions[f"{name}{view}"] = caption + more
     return drawn, captions
+
+
+def _uncertainty(run: Run) -> Uncertainty | None:
+    """How far the parameters are known, if the model is one of simulations and not too large."""
+    dataset, model = run.dataset, run.model
+    records = dataset.train
+    if run.refit is not None:
+        records = all_records(records, [*dataset.validation, *dataset.selection])
+    samples = sum(record.y.size for record in records)
+    if samples * model.parameter_count**2 > _MOST_WORK or run.settings.horizon is not None:
+        return None
+    try:
+        return uncertainty(model, records)
+    except ValueError:
+        return None
 
 
 def _measured(records: Sequence[Record]) -> FRF | None:

@@ -25,6 +25,7 @@ from lfrtorch._support.drawing import (
 )
 from lfrtorch._support.tables import engineering, factor_of, quantity
 from lfrtorch._support.types import Array
+from lfrtorch.analysis.confidence_bands import Band
 from lfrtorch.analysis.densities import power_density
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.metrics import rms
@@ -96,10 +97,16 @@ def response(record: Record, simulated: Simulated, outputs: Sequence[int] | None
     return figure
 
 
-def close_up(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
+def close_up(
+    record: Record,
+    simulated: Simulated,
+    outputs: Sequence[int] | None = None,
+    *,
+    band: Band | None = None,
+) -> Figure:
     """Draw the response about the largest error of the first model that is not linear."""
     near = _worst_stretch(record, simulated, outputs)
-    figure = _overlay(record, simulated, outputs, near, _NARROW)
+    figure = _overlay(record, simulated, outputs, near, _NARROW, band=band)
     figure.suptitle(f"{record.name}: about the largest error", fontsize="medium")
     return figure
 
@@ -201,6 +208,7 @@ def _overlay(
     width: float,
     *,
     fits: bool = False,
+    band: Band | None = None,
 ) -> Figure:
     """Measured and simulated outputs of a part of the scored samples, and the errors below."""
     # With ``fits`` the inputs stand above, as what the outputs answer to.
@@ -226,6 +234,9 @@ def _overlay(
             error = (y - own)[part]
             below.plot(*envelope(t, error), style, lw=1.0, color=colour, label=name)
             reach = max(reach, np.max(np.abs(error), initial=0.0, where=np.isfinite(error)))
+        if band is not None:
+            edges = [(edge - band.y)[scored, i][part] for edge in band.interval(noise=True)]
+            below.fill_between(t, *edges, color=NL_LFR, alpha=0.2, lw=0, label="95 % band")
         span = float(np.ptp(y)) or 1.0
         low, high = above.get_ylim()
         low, high = max(low, y.min() - _BEYOND * span), min(high, y.max() + _BEYOND * span)

@@ -1,8 +1,11 @@
 """Which records and outputs a report shows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+import lfrtorch
 from lfrtorch.dataset import Dataset
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import figures, plots
@@ -16,7 +19,7 @@ Y = np.random.default_rng(0).standard_normal((200, 1))
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """A figure is what it was asked to show."""
     for name in ("response", "close_up", "spectrum", "density", "distribution"):
-        monkeypatch.setattr(plots, name, lambda *asked, name=name: (name, *asked[2:]))
+        monkeypatch.setattr(plots, name, lambda *asked, name=name, **_: (name, *asked[2:]))
 
 
 def responses(use: str, errors: dict[str, float]) -> list[Response]:
@@ -68,3 +71,16 @@ def test_many_outputs_have_several_files_and_the_first_is_in_the_report():
     assert drawn["a"] == ("spectrum", range(4))
     assert drawn["a_response_5_to_6"] == ("response", range(4, 6))
     assert all("Outputs 5 to 6: in figures/." in caption for caption in captions.values())
+
+
+def test_the_captions_say_what_the_bands_are_and_what_speaks_against_them():
+    u = np.random.default_rng(0).standard_normal((400, 1))
+    y = np.tanh(u) + 0.1 * np.random.default_rng(1).standard_normal((400, 1))
+    record = Record(u, y, name="a")
+    settings = lfrtorch.Settings(nx=1, nz=1, nn=3, starts=1)
+    run = lfrtorch.identify(Dataset("lab", record), settings)
+    drawn, views = figures.of_run(run)
+    assert "where 95 % of the errors are" in views["a"]["a_near"]
+    assert {"a_near", "steps", "static_map"} <= {*drawn}
+    run = replace(run, settings=replace(run.settings, horizon=20))  # fitted in windows: no bands
+    assert "95 %" not in figures.of_run(run)[1]["a"]["a_near"]

@@ -5,6 +5,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle, StepPatch
 
+from lfrtorch.analysis.confidence_bands import Band
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import plots
@@ -63,6 +64,16 @@ def test_figures_of_a_linear_model_have_its_lines_alone():
         assert labels(figure.axes[0]) == lines
         assert any(f"({unit})" in ax.get_xlabel() for ax in figure.axes)
     assert labels(plots.close_up(RECORD, both(0.9 * Y)).axes[0]) == ["measured", "linear"]
+
+
+def test_the_close_up_has_the_band_of_the_errors():
+    std, noise = np.full_like(RECORD.y, 3.0), np.array([4.0])
+    band = Band(RECORD.outputs, 0.9 * RECORD.y, std, noise, np.zeros(RECORD.samples))
+    above, below, *_ = plots.close_up(RECORD, both(0.9 * Y), band=band).axes
+    assert not above.collections
+    (filled,) = below.collections
+    edges = np.asarray(filled.get_paths()[0].vertices)[:, 1]
+    assert [edges.min(), edges.max()] == pytest.approx([-1.96 * 5.0, 1.96 * 5.0], rel=1e-3)
 
 
 def test_response_overlays_the_scored_samples_with_the_errors_below():
