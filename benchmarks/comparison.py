@@ -98,6 +98,8 @@ def run(name: str, script: str, options: argparse.Namespace) -> dict[str, Any]:
         except subprocess.TimeoutExpired:
             return {"failed": "not done in two minutes"}
         seconds = time.time() - begin
+        if done.returncode and seconds > SECONDS - GRACE:  # it ended itself in time
+            return {"failed": "not done in two minutes"}
         if done.returncode or not out.exists():
             return {"failed": (done.stderr.strip().splitlines() or ["no output"])[-1][:200]}
         errors = (np.load(out) - y)[cut:]
