@@ -235,8 +235,8 @@ def _overlay(
             below.plot(*envelope(t, error), style, lw=1.0, color=colour, label=name)
             reach = max(reach, np.max(np.abs(error), initial=0.0, where=np.isfinite(error)))
         if band is not None:
-            edges = [(edge - band.y)[scored, i][part] for edge in band.interval(noise=True)]
-            below.fill_between(t, *edges, color=NL_LFR, alpha=0.2, lw=0, label="95 % band")
+            low, high = ((edge - band.y)[scored, i][part] for edge in band.interval(noise=True))
+            below.fill_between(t, low, high, color=NL_LFR, alpha=0.2, lw=0, label="95 % band")
         span = float(np.ptp(y)) or 1.0
         low, high = above.get_ylim()
         low, high = max(low, y.min() - _BEYOND * span), min(high, y.max() + _BEYOND * span)

@@ -1,6 +1,7 @@
 """The comparison with other packages: what a script gets, what is kept of it, the page."""
 
 import argparse
+import importlib.util
 import json
 import re
 import sys
@@ -10,8 +11,11 @@ import numpy as np
 import pytest
 
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
-sys.path.append(str(FOLDER))
-import comparison  # noqa: E402
+spec = importlib.util.spec_from_file_location("comparison", FOLDER / "comparison.py")
+assert spec is not None
+assert spec.loader is not None
+comparison = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(comparison)
 
 
 @pytest.fixture

@@ -78,7 +78,7 @@ def test_the_captions_say_what_the_bands_are_and_what_speaks_against_them():
     y = np.tanh(u) + 0.1 * np.random.default_rng(1).standard_normal((400, 1))
     record = Record(u, y, name="a")
     settings = lfrtorch.Settings(nx=1, nz=1, nn=3, starts=1)
-    run = lfrtorch.identify(Dataset("lab", record), settings)
+    run = lfrtorch.identify(Dataset("lab", [record]), settings)
     drawn, views = figures.of_run(run)
     assert "where 95 % of the errors are" in views["a"]["a_near"]
     assert {"a_near", "steps", "static_map"} <= {*drawn}

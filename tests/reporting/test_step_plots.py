@@ -25,7 +25,7 @@ def test_steps_of_a_linear_model_lie_on_each_other():
     *of_model, of_linear = ax.lines
     assert len(of_model) == 4
     for line in of_model:
-        np.testing.assert_allclose(line.get_ydata(), of_linear.get_ydata(), atol=1e-8)
+        assert np.allclose(np.asarray(line.get_ydata()), np.asarray(of_linear.get_ydata()))
     dc = linear.D + linear.C @ np.linalg.solve(np.eye(1) - linear.A, linear.B)
     np.testing.assert_allclose(np.asarray(of_linear.get_ydata())[-1], dc[0, 0], rtol=0.02)
     assert ax.get_ylabel() == "flow per valve (l/s/%)"
@@ -35,7 +35,7 @@ def test_steps_of_a_linear_model_lie_on_each_other():
 def test_steps_of_a_saturation_gain_less_the_higher_they_are():
     record = saturating()
     settings = lfrtorch.Settings(nx=1, nz=1, nn=6, starts=1)
-    run = lfrtorch.identify(lfrtorch.Dataset("saturation", record), settings)
+    run = lfrtorch.identify(lfrtorch.Dataset("saturation", [record]), settings)
     low, half, more, high, _ = (
         float(np.asarray(line.get_ydata())[-1])
         for line in steps(run.model, run.linear, [record]).axes[0].lines
