@@ -182,8 +182,8 @@ def test_run_writes_its_folder_and_the_checkpoint_simulates(csv, tmp_path, monke
         assert (tmp_path / name).is_file()
     assert list(tmp_path.glob("events.out.tfevents.*"))
     page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 9
-    # five of the test, BLA, poles, map, history
+    assert page.count("data:image/png;base64,") == 10
+    # five of the test, BLA, poles, map, steps, history
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "starts=8" in line]
     assert line.startswith("next: ")
     metrics = json.loads((tmp_path / "metrics.json").read_text())
