@@ -134,12 +134,13 @@ def estimated_start(
     def squares(found: Trajectory) -> Tensor:
         return (weight * (found.y - y)).square().sum(dim=(1, 2))
 
-    first = rest
+    first, settled = rest, False
     if near is not None:
         there = simulate(cell, u, near)
-        closer = (squares(there) < squares(rest))[:, None, None]  # False for NaN
+        closer = squares(there) < squares(rest)  # False for NaN
+        settled = bool(closer.all())
         pairs = zip(there, rest, strict=True)
-        first = Trajectory(*(torch.where(closer, a, b) for a, b in pairs))
+        first = Trajectory(*(torch.where(closer[:, None, None], a, b) for a, b in pairs))
     free = _fitted_start(cell, u, y, weight, first)
     stayed = ~free.x[:, 0].any(dim=1)  # Gauss-Newton may fail on many states
     odd = (white @ free.x[:, 0].unsqueeze(-1)).square().sum(dim=(1, 2))
@@ -147,7 +148,7 @@ def estimated_start(
         return _staying(cell, whole, free.x, white)
     variance = squares(rest).nan_to_num(0.0, 0.0) / counted.clamp_min(1)
     prior = _Prior(white, axes * moments.sqrt().unsqueeze(-2), variance, counted)
-    probable = _fitted_start(cell, u, y, weight, first, prior, settled=near is not None)
+    probable = _fitted_start(cell, u, y, weight, first, prior, settled=settled)
     lost = ~torch.isfinite(squares(probable))
     better = ~known | lost | ((squares(free) < _FAR * squares(probable)) & (counted > 2 * nx))
     found = torch.where(better[:, None, None], free.x, probable.x)
