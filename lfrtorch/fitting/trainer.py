@@ -389,8 +389,9 @@ class Fit:
         if self.ranks.world > 1:  # what was kept of the terms is the first process's part
             kept = {name: part for name, part in kept.items() if "." not in name}
         self.problem.load_state_dict(kept)
-        if self.judge is not None:
-            self.judge.load_state_dict(state_file.within("judge.", tensors))
+        judged = state_file.within("judge.", tensors)  # those of before have none
+        if self.judge is not None and judged:
+            self.judge.load_state_dict(judged)
         try:
             state = state_file.unpacked(like, numbers["state"], tensors)
         except TypeError:
