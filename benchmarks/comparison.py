@@ -31,14 +31,20 @@ from lfrtorch import datasets
 SCRIPTS = Path(__file__).resolve().parent / "contestants"
 RESULTS = Path(__file__).with_suffix(".json")
 SECONDS, GRACE = 120.0, 15.0
-CONTESTANTS = {
-    "lfrtorch": ("lfrtorch_auto", "lfrtorch_order"),
-    "freq-statespace": ("freq_statespace_polynomial", "freq_statespace_network"),
-    "jax-sysid": ("jax_sysid_residual", "jax_sysid_seeds"),
-    "sysidentpy": ("sysidentpy_default", "sysidentpy_book"),
-    "tsfast": ("tsfast_quick", "tsfast_lstm"),
-    "neural-ssm": ("neural_ssm_lru", "neural_ssm_long"),
-}
+CONTESTANTS = (
+    "lfrtorch_auto",
+    "lfrtorch_order",
+    "freq_statespace_polynomial",
+    "freq_statespace_network",
+    "jax_sysid_residual",
+    "jax_sysid_seeds",
+    "sysidentpy_default",
+    "sysidentpy_book",
+    "tsfast_quick",
+    "tsfast_lstm",
+    "neural_ssm_lru",
+    "neural_ssm_long",
+)
 SYSTEMS = {  # states of the literature, unit of the error, its factor
     "silverbox": (2, "mV", 1e3),
     "wiener_hammerstein": (6, "mV", 1e3),
@@ -137,7 +143,7 @@ def table(every: dict[str, dict[str, Any]]) -> str:
         error = f"**{error}**" if entry["rmse"] <= best[name] else error
         return f"{error} ({entry['seconds']:.0f} s)"
 
-    for script in (script for pair in CONTESTANTS.values() for script in pair):
+    for script in CONTESTANTS:
         what, counted = about(script)
         cells = " | ".join(cell(name, script) for name in SYSTEMS)
         rows.append(f"| {what} | {counted} | {cells} |")
@@ -153,10 +159,9 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=[], help="systems or scripts")
     options = parser.parse_args()
     every = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    scripts = [script for pair in CONTESTANTS.values() for script in pair]
     if options.root:
         for name in SYSTEMS:
-            for script in scripts:
+            for script in CONTESTANTS:
                 if name in WILD and options.wild is None:
                     continue
                 wanted = not options.only or {name, script} & {*options.only}

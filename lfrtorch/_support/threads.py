@@ -96,8 +96,8 @@ def spread(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:
 def worth_threads(samples: int, parameters: int = 70) -> bool:
     """Return whether fits of this size gain by threads of their own.
 
-    Those of smaller ones wait for the interpreter: on two cores, 8 starts of 200 to 4000 samples
-    and 70 parameters took 1.1 to 1.7 times as long as on one.
+    Those of smaller ones wait for the interpreter: starts of 200 to 4000 samples and some 70
+    parameters took 1.0 to 1.6 times as long on two cores as on one.
     """
     return samples * parameters**2 >= 4e7
 

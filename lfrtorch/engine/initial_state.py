@@ -275,7 +275,7 @@ def _fitted_start(
             best = Trajectory(*(torch.where(better[:, None, None], t, b) for t, b in pairs))
             waiting &= ~better
             step = step / 4
-        if passes == PASSES and not (cost < (1.0 - _TOLERANCE) * before).any():
+        if passes == PASSES and not (cost < (1.0 - tolerance) * before).any():
             break
     return best
 

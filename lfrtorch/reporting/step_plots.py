@@ -19,6 +19,7 @@ _HEIGHTS = (-1.0, -0.5, 0.5, 1.0)  # parts of the way to where the training inpu
 _SELDOM = 2.0  # per cent of the samples beyond that
 _LEFT = 0.02  # of a step, when it has settled
 _DRIFT = 0.15  # of a step, in its last quarter, where it is not settled
+_STILL = 1e-3  # of an output's deviation, below which it does not move
 _FEWEST, _LONGEST = 20, 10_000  # samples of a step
 
 
@@ -38,6 +39,7 @@ def steps(model: Model, linear: LinearModel, records: list[Record]) -> Figure:
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(len(outputs), len(inputs), squeeze=False, sharex=True)
     t = np.arange(settled) / model.fs
+    still = _STILL * np.std(np.concatenate([record.y for record in records]), axis=0)
     for j, source in enumerate(inputs):
         every = np.concatenate([record.u[:, j] for record in records]) - rest[j]
         low, high = np.percentile(every, [_SELDOM, 100.0 - _SELDOM])
@@ -45,11 +47,11 @@ def steps(model: Model, linear: LinearModel, records: list[Record]) -> Figure:
         for height, colour in zip(heights, CHANNELS, strict=False):
             if abs(height) < 1e-9 * max(abs(low), abs(high)) or not height:
                 continue
-            found = _step(model, rest, j, height, settled) / height
+            found = _step(model, rest, j, height, settled, still) / height
             for i in range(len(outputs)):
                 label = f"{height:+.3g} {source.unit}".rstrip()
                 grid[i, j].plot(t, found[:, i], lw=1.2, color=colour, label=label)
-        found = _step(linear, rest, j, 1.0, settled)
+        found = _step(linear, rest, j, 1.0, settled, still)
         for i, output in enumerate(outputs):
             ax = grid[i, j]
             ax.plot(t, found[:, i], "--", lw=1.2, color=LINEAR, label="linear")
@@ -58,7 +60,8 @@ def steps(model: Model, linear: LinearModel, records: list[Record]) -> Figure:
             ax.set_ylabel(f"{output.name} per {source.name}{own}")
             ax.grid(True, alpha=0.2)
             ax.margins(x=0)
-    legend_above(grid[0, 0])
+    for ax in grid[0]:
+        legend_above(ax)
     for ax in grid[-1]:
         ax.set_xlabel("time after the step (s)" if model.fs != 1.0 else "samples after the step")
     return figure
@@ -73,14 +76,17 @@ def _settling(linear: LinearModel, most: int) -> int:
     return int(min(max(_FEWEST, 1.2 * samples), most, _LONGEST))
 
 
-def _step(model: Model | LinearModel, rest: Array, j: int, height: float, settled: int) -> Array:
+def _step(
+    model: Model | LinearModel, rest: Array, j: int, height: float, settled: int, still: Array
+) -> Array:
     """Change of the outputs (settled, ny) after input j has gone up; before, all were at rest."""
     u = np.tile(rest, (4 * settled, 1))
     u[3 * settled :, j] += height
     y = model.simulate(u)
     change = y[3 * settled :] - y[3 * settled - 1]
     last = settled // 4  # samples before the step, and of the step, in which little moves
-    drift = max(float(np.ptp(part[-last:], axis=0).max()) for part in (y[: 3 * settled], change))
-    if not np.isfinite(y).all() or drift > _DRIFT * np.abs(change).max():
+    moved = [np.ptp(part[-last:], axis=0) for part in (y[: 3 * settled], change)]
+    least = np.maximum(_DRIFT * np.abs(change).max(axis=0), still)
+    if not np.isfinite(y).all() or (np.maximum(*moved) > least).any():
         raise InputError("the model does not come to rest at the mean of its inputs.")
     return change

@@ -20,10 +20,8 @@ spec.loader.exec_module(comparison)
 
 @pytest.fixture
 def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> argparse.Namespace:
-    """Records of 400 samples, scripts in a folder of their own, three seconds for each."""
+    """Records of 400 samples, and scripts in a folder of their own."""
     monkeypatch.setattr(comparison, "SCRIPTS", tmp_path)
-    monkeypatch.setattr(comparison, "SECONDS", 3.0)
-    monkeypatch.setattr(comparison, "GRACE", 1.0)
     (tmp_path / "given.py").write_text((FOLDER / "contestants" / "given.py").read_text())
     (tmp_path / "two_tanks").mkdir()
     u = np.random.default_rng(0).standard_normal(400)
@@ -45,13 +43,11 @@ def test_the_error_is_that_of_the_last_quarter(options: argparse.Namespace):
     found = ended(options, wrong)
     assert found["rmse"] == pytest.approx(0.5)
     assert found["nrmse"] == pytest.approx(0.25, rel=0.2)
-    assert 0 < found["seconds"] < 4
 
 
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("import time\ntime.sleep(9)", "not done in two minutes"),
         ("raise ValueError('no')", "ValueError: no"),
         ("pass", "no output"),
         ("from given import every_u, keep\nkeep(every_u * float('nan'))", "diverges"),
@@ -61,10 +57,19 @@ def test_a_script_that_fails_has_its_reason(options: argparse.Namespace, text: s
     assert why in ended(options, text)["failed"]
 
 
+def test_a_script_that_goes_on_is_ended(
+    options: argparse.Namespace, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(comparison, "SECONDS", 1.0)
+    monkeypatch.setattr(comparison, "GRACE", 1.0)
+    found = ended(options, "import time\ntime.sleep(600)")
+    assert found == {"failed": "not done in two minutes"}
+
+
 def test_as_many_iterations_are_made_as_the_time_allows(
     options: argparse.Namespace, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(comparison, "SECONDS", 14.0)  # ten are left for the simulation
+    monkeypatch.setattr(comparison, "SECONDS", 60.0)  # ten are left for the simulation
     counts = options.wild / "counts.txt"
     text = "import time\nfrom given import affordable, every_u, keep\n"
     text += "few = affordable(lambda n: time.sleep(0.05 * n), 1000)\n"
@@ -73,7 +78,7 @@ def test_as_many_iterations_are_made_as_the_time_allows(
     assert "failed" not in ended(options, text)
     few, many = map(int, counts.read_text().split())
     assert many == 1000
-    assert 10 < few < 80
+    assert 50 < few < 1000  # a twentieth of a second each
 
 
 def test_the_page_has_the_table_of_the_results():
@@ -81,6 +86,6 @@ def test_the_page_has_the_table_of_the_results():
     page = (FOLDER / "comparison.md").read_text()
     assert comparison.table(every) in page
     scripts = {path.stem for path in comparison.SCRIPTS.glob("*.py")} - {"given"}
-    assert scripts == {script for pair in comparison.CONTESTANTS.values() for script in pair}
+    assert scripts == {*comparison.CONTESTANTS}
     assert {*every} == {*comparison.SYSTEMS}
     assert re.search(r"no test record is used", page)

@@ -54,3 +54,20 @@ def test_a_model_without_rest_has_no_steps():
         steps(linear.to_model(), integrating, [record])
     with pytest.raises(ValueError, match="does not come to rest"):
         steps(integrating.to_model(), linear, [record])
+
+
+def test_each_input_has_its_heights_and_each_output_its_own_rest():
+    u = np.random.default_rng(0).standard_normal((600, 2)) * [1.0, 100.0]
+    fast, slow = np.zeros(600), np.zeros(600)
+    for k in range(599):  # the first input moves the first output alone, in other units
+        fast[k + 1] = 0.5 * fast[k] + 1e6 * u[k, 0]
+        slow[k + 1] = 0.9 * slow[k] + 1e-3 * u[k, 1]
+    record = lfrtorch.Record(u, np.column_stack([fast, slow]), skip=20)
+    linear = lfrtorch.estimate_bla(record, 2)
+    axes = steps(linear.to_model(), linear, [record]).axes
+    assert len(axes) == 4
+    for ax, reach in zip(axes[:2], (2.0, 200.0), strict=True):
+        legend = ax.get_legend()
+        assert legend is not None
+        first = float(legend.get_texts()[0].get_text())
+        assert -1.3 * reach < first < -0.7 * reach
