@@ -38,7 +38,7 @@ from lfrtorch.fitting.last_fits import distilled, refitted, without_poor_starts
 from lfrtorch.fitting.multistart import cheap_starts, fit
 from lfrtorch.fitting.observer import LineObserver, Observer
 from lfrtorch.fitting.plain_settings import PlainSettings
-from lfrtorch.fitting.refit import all_records
+from lfrtorch.fitting.refit import estimation_records
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.stage import Stage
@@ -282,7 +282,7 @@ def _of_outputs(settings: Settings, dataset: Dataset) -> Settings:
 
 def _all_estimation(dataset: Dataset) -> Dataset:
     """The dataset with all records but the tests for training."""
-    train = all_records(dataset.train, [*dataset.validation, *dataset.selection])
+    train = estimation_records(dataset)
     return replace(dataset, train=train, validation=[], selection=[])
 
 
@@ -364,9 +364,7 @@ def scored_run(
     )
     known = None
     if known_parts(model.lfr.cell.static) is not None:
-        of = dataset.train
-        if again is not None:
-            of = all_records(dataset.train, [*dataset.validation, *dataset.selection])
+        of = dataset.train if again is None else estimation_records(dataset)
         ridge = 0.0 if isinstance(settings.ridge, Mapping | str) else settings.ridge
         if begins_at_outputs(of) and settings.horizon is not None:
             of = windows(of, settings.horizon, model.lfr.cell.nx, y_scale=model.scaler.y_scale)

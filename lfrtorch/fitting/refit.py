@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from lfrtorch._support.arguments import typed
+from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.plain_settings import Noise
@@ -96,6 +97,11 @@ def refit(
         ranks=ranks,
         stop=stop,
     )
+
+
+def estimation_records(dataset: Dataset) -> list[Record]:
+    """What a second fit is to: all records but the tests."""
+    return all_records(dataset.train, [*dataset.validation, *dataset.selection])
 
 
 def all_records(train: Sequence[Record], held_out: Sequence[Record]) -> list[Record]:

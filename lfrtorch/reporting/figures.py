@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from lfrtorch._support.errors import InputError
-from lfrtorch.analysis.confidence_bands import Uncertainty, uncertainty
+from lfrtorch.analysis.confidence_bands import Band, Uncertainty, uncertainty
 from lfrtorch.analysis.model_plots import static_figure
 from lfrtorch.dataset import Dataset
-from lfrtorch.fitting.refit import all_records
+from lfrtorch.fitting.refit import estimation_records
 from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.records import Record, common_unit
 from lfrtorch.reporting import linear_plots, plots
@@ -82,9 +83,8 @@ def of_record(
     whole = plots.is_whole(record)
     spectrum = plots.spectrum if whole else plots.density
     of_spectrum = "Spectrum over whole periods." if whole else "Power spectral density."
-    of_near, band = "The grey stretch, about the largest error.", None
-    if known is not None:
-        band = known.simulate(record)
+    of_near, band = "The grey stretch, about the largest error.", _band(record, known)
+    if known is not None and band is not None:
         of_near += " Band: where 95 % of the errors are if noise and what the data leave open of "
         of_near += "the parameters are all there is."
         of_near += "".join(f" But {doubt.rstrip('.')}." for doubt in known.doubts[:1])
@@ -108,17 +108,23 @@ def of_record(
 
 def _uncertainty(run: Run) -> Uncertainty | None:
     """How far the parameters are known, if the model is one of simulations and not too large."""
-    dataset, model = run.dataset, run.model
-    records = dataset.train
-    if run.refit is not None:
-        records = all_records(records, [*dataset.validation, *dataset.selection])
+    records = run.dataset.train if run.refit is None else estimation_records(run.dataset)
     samples = sum(record.y.size for record in records)
-    if samples * model.parameter_count**2 > _MOST_WORK or run.settings.horizon is not None:
+    large = samples * run.model.parameter_count**2 > _MOST_WORK
+    if large or run.settings.horizon is not None:
         return None
     try:
-        return uncertainty(model, records)
-    except ValueError:
+        return uncertainty(run.model, records)
+    except ValueError:  # predictions were fitted, or there are more parameters than samples
         return None
+
+
+def _band(record: Record, known: Uncertainty | None) -> Band | None:
+    """The band of a record that is not too long for it."""
+    if known is None or record.y.size * len(known.kept) ** 2 > _MOST_WORK:
+        return None
+    band = known.simulate(record)
+    return band if np.isfinite(band.std).all() else None
 
 
 def _measured(records: Sequence[Record]) -> FRF | None:
