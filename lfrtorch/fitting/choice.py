@@ -51,6 +51,7 @@ from lfrtorch.least_squares.guarantee import Name
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
+from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.linear.bla import refined_near
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -454,6 +455,16 @@ class _Study:
         # Nothing here looks at what is measured where it is left out.
         problem = Problem.of(model, fold.train, guarantee=self._guarantee)
         theta = problem.theta
+        # Start states at one ridge are near those at the next.
+        judged = [
+            SimulationErrors(
+                model.lfr.cell,
+                [model.scaler.normalise(record)],
+                Ranks(),
+                solve_initial_states=True,
+            )
+            for record in self._records
+        ]
         for ridge, iterations in self._ridges:
             problem.weigh(ridge)
             search = LevenbergMarquardt(max_iter=iterations, tolerance=1e-3, patience=2)
@@ -465,9 +476,13 @@ class _Study:
             theta = state.theta
             problem.write(theta)
             stable = largest_stable_amplitude(model, fold.train) >= max(LOUDER)
-            yield state.cost if stable else np.inf, self._simulated((model, fold))
+            found = []
+            for record, each in zip(self._records, judged, strict=True):
+                y = each.trajectories(theta[: each.parameters.own])[0].y[0]
+                found.append(record.shown(model.scaler.restore_y(y.double().numpy())))
+            yield state.cost if stable else np.inf, fold.left_out(found)
 
-    def _simulated(self, job: tuple[Model | LinearModel, Fold]) -> Array:
+    def _simulated(self, job: tuple[LinearModel, Fold]) -> Array:
         """Return the simulated output where it was left out."""
         model, fold = job
         with np.errstate(over="ignore", invalid="ignore"):

@@ -84,12 +84,16 @@ class SimulationErrors:
         """States of each group at a θ close to the next one."""
         self._starts: list[Tensor | None] = [None] * len(self.groups)
         """Initial states of each group that were solved for last."""
+        self._written: Tensor | None = None
+        """The θ whose weights the cell has."""
         # A search evaluates r at a θ and, if it accepts it, J there: one simulation serves both.
         self._latest: tuple[Tensor, list[Trajectory]] | None = None
 
     def cell_at(self, theta: Float[Tensor, " P"]) -> LFRCell:
         """The model with the weights in θ, until the next call."""
-        self.parameters.write(self._cell, theta)
+        if self._written is None or not torch.equal(self._written, theta):
+            self._written = theta.clone()
+            self.parameters.write(self._cell, self._written)
         return self._cell
 
     def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
