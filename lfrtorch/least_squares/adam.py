@@ -1,7 +1,11 @@
-"""Adam on the full batch, a baseline for Levenberg-Marquardt."""
+"""Adam, a baseline for Levenberg-Marquardt: on minibatches of many records, or on all of a few.
+
+Records are many where a fit is over windows. An epoch then has a step for each minibatch of them.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -23,6 +27,14 @@ class Differentiable(Protocol):
     ) -> tuple[Float[Tensor, " M"], Float[Tensor, " P"]]:
         """r and the gradient of its mean square at θ."""
         ...
+
+    def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
+        """r at θ."""
+        return self.gradient(theta)[0]
+
+    def minibatches(self, epoch: int) -> Sequence[Differentiable]:
+        """Parts of the data, another division of it in each epoch; this if it is not divided."""
+        return [self]
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
         """θ, or one near it that the search may go to."""
@@ -74,10 +86,19 @@ class Adam(AdamOptions):
         optimiser = torch.optim.Adam([parameter], lr=self.learning_rate)
         if state.moments:
             optimiser.state[parameter] = {k: v.clone() for k, v in state.moments.items()}
-        parameter.grad = state.gradient
-        optimiser.step()
-        theta = problem.admissible(parameter.detach())
-        residual, gradient = problem.gradient(theta)
+        theta, gradient = state.theta, state.gradient
+        parts = problem.minibatches(state.iteration)
+        for part in parts:
+            if len(parts) > 1:
+                _, gradient = part.gradient(theta)
+            parameter.grad = gradient
+            optimiser.step()
+            theta = problem.admissible(parameter.detach().clone())
+            parameter.data.copy_(theta)
+        if len(parts) > 1:
+            residual = problem.residual(theta)
+        else:
+            residual, gradient = problem.gradient(theta)
         iteration = state.iteration + 1
         reason = Reason.ALL_EPOCHS if iteration >= self.max_iter else ""
         if not torch.isfinite(gradient).all():

@@ -81,7 +81,7 @@ class LevenbergMarquardtOptions:
 class AdamOptions:
     """Options of :class:`lfrtorch.Adam`."""
 
-    max_iter: int = setting(2000, "most steps; each sees all the data.", least=0)
+    max_iter: int = setting(2000, "most epochs; each sees all the data.", least=0)
     learning_rate: float = setting(1e-3, "step size, in normalised units.", positive=True)
     guarantee: Literal["stable", "contracting"] | float | None = _GUARANTEE
 

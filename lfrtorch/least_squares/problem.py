@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from functools import partial
 from typing import Self
 
@@ -26,6 +27,9 @@ from lfrtorch.least_squares.simulation_errors import SimulationErrors, SystemErr
 from lfrtorch.least_squares.term import Term
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
+
+BATCH = 32
+"""Records in a minibatch, about."""
 
 
 class Problem(LeastSquares):
@@ -212,6 +216,27 @@ class Problem(LeastSquares):
         """r and the gradient of |r|² / samples, by the adjoint recurrence."""
         r = self.residual(theta)
         return r, 2.0 / self.size * self.linearise(theta, reduce=False).adjoint(r)
+
+    def minibatches(self, epoch: int) -> list[Problem]:
+        """Problems of some ``BATCH`` records each, drawn anew in each epoch; of few records, this.
+
+        Their gradients are those of the mean over their own records.
+        """
+        counts = [len(group.u) for group in self.errors.groups]
+        parts = math.ceil(sum(counts) / BATCH)
+        ridges = [term for term in self._terms if isinstance(term, RidgePenalty)]
+        if sum(counts) < 2 * BATCH or self.ranks.world > 1 or len(self._terms) > 1 + len(ridges):
+            return [self]
+        generator = torch.Generator().manual_seed(epoch)
+        orders = [torch.randperm(count, generator=generator) for count in counts]
+        found = []
+        for i in range(parts):
+            part = copy(self)
+            part.errors = self.errors.part([order[i::parts] for order in orders])
+            part._terms = [part.errors, *(ridge.part(parts) for ridge in ridges)]
+            part._reduced, part._checked = None, set()
+            found.append(part)
+        return found
 
     def release(self) -> None:
         """Free the memory of what only speeds up the next evaluation."""

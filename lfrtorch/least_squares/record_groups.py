@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -40,6 +40,12 @@ class RecordGroup:
     # Which way an output may be beyond a limit of its sensor: 1, -1 or 0.
     beyond: Float[Tensor, "R T ny"] | None = None
     limits: Float[Tensor, "R 2 1 ny"] | None = None
+
+    def part(self, records: Int[Tensor, " n"]) -> RecordGroup:
+        """Some of the records."""
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        cut = {name: part[records] for name, part in own.items() if isinstance(part, Tensor)}
+        return replace(self, **cut)
 
     def shown(self, y_hat: Float[Tensor, "R T ny"]) -> Float[Tensor, "R T ny"]:
         """An output as the sensors show it, which is what a score sees."""

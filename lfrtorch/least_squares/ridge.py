@@ -36,6 +36,10 @@ class RidgePenalty(Term):
         """The rows of dr/dθ, a diagonal matrix."""
         return [PenaltyRows(self._root, self.residual(theta))]
 
+    def part(self, count: int) -> RidgePenalty:
+        """The penalty beside one of so many parts of the data."""
+        return RidgePenalty(self._root.square() / count, self._theta_0)
+
     def state_dict(self) -> dict[str, Tensor]:
         """θ_0."""
         return {"start": self._theta_0}

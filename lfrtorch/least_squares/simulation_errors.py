@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
+from copy import copy, deepcopy
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
@@ -157,6 +157,17 @@ class SimulationErrors:
             self._starts[i] = found
             return found
         return self.parameters.initial_states(theta)[group.estimated]
+
+    def part(self, chosen: Sequence[Int[Tensor, " n"]]) -> SimulationErrors:
+        """The errors of some records of each group, as functions of the same θ."""
+        found = copy(self)
+        pairs = zip(self.groups, chosen, strict=True)
+        found.groups = [group.part(records) for group, records in pairs if len(records)]
+        found.size = int(sum(group.scored.sum() for group in found.groups))
+        found._cell, found._memory = deepcopy(self._cell), Memory()
+        found._guesses, found._starts = [None] * len(found.groups), [None] * len(found.groups)
+        found._written = found._latest = None
+        return found
 
     def first_initial_states(self) -> Float[Tensor, "states nx"]:
         """Initial states in θ that fit best at the weights that were given."""

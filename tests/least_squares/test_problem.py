@@ -513,3 +513,32 @@ def test_search_leaves_fixed_entries_and_brings_the_rest_home(
     assert torch.equal(state.theta[problem.fixed], theta[problem.fixed])
     # Noise-free, and θ_start of the ridge is the planted θ: the search ends at rounding.
     assert problem.rmse(state.theta) < 1e-8
+
+
+@pytest.mark.parametrize("ridge", [0.0, 2.0])
+def test_minibatches_are_the_whole_in_parts(model: Model, ridge: float):
+    kinds = all_kinds(model)
+    records = [replace(kinds[i % len(kinds)], weight=1.0 + i % 3) for i in range(80)]
+    problem = Problem.of(model, records, ridge=ridge)
+    theta = problem.theta + 1e-2 * normal(len(problem.theta), seed=5)
+    _, whole = problem.gradient(theta)
+    parts = problem.minibatches(0)
+    assert len(parts) == 3  # of 32 records at most
+    assert sum(part.size for part in parts) == problem.size
+    total = torch.stack([part.size / problem.size * part.gradient(theta)[1] for part in parts])
+    assert_close(total.sum(0), whole)
+    assert_close(problem.gradient(theta)[1], whole)  # the parts have weights of their own
+
+
+def test_minibatches_are_drawn_anew_and_again_the_same(model: Model):
+    problem = Problem.of(model, some_records(model) * 20)
+    first, again, other = (
+        problem.minibatches(epoch)[0].residual(problem.theta) for epoch in (0, 0, 1)
+    )
+    assert torch.equal(first, again)
+    assert first.shape != other.shape or not torch.equal(first, other)
+
+
+def test_few_records_are_not_divided(model: Model):
+    problem = Problem.of(model, some_records(model))
+    assert problem.minibatches(0) == [problem]
