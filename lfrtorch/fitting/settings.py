@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from inspect import signature
 from typing import Any, Literal, cast
 
+import numpy as np
 import torch
 from torch.nn import Module
 
@@ -199,7 +200,7 @@ class Settings(PlainSettings):
         )
         given = {name: getattr(self, name, None) for name in {*USUAL} - own}
         parts = {"guarantee": getattr(self.trainer, "guarantee", None)}
-        return given | parts | {"integrators": self.linear.get("integrators", 0)}
+        return given | parts | {"integrators": int(np.max(self.linear.get("integrators", 0)))}
 
     @property
     def known_states(self) -> int:

@@ -28,6 +28,7 @@ from lfrtorch.linear.integrators import (
     differenced_weight,
     gain,
     integrated,
+    integrators_of,
     placed,
     simulation_errors,
     whitening_pole,
@@ -80,7 +81,7 @@ def estimate_bla(
     weight: Weight | Array | None = None,
     offset: bool = True,
     feedthrough: bool = True,
-    integrators: Literal[0, 1, 2] = 0,
+    integrators: int | Sequence[int] = 0,
     max_iter: int = 200,
 ) -> LinearModel:
     """Best linear approximation of order ``nx``: a stable model that minimises a squared error.
@@ -116,7 +117,8 @@ def estimate_bla(
         feedthrough: whether the input acts on the output at once; otherwise D is 0, as it must be
             for data under feedback, which a prediction fits without bias.
         integrators: poles at z = 1 behind each output, exactly: 1 from a speed to a position, 2
-            from a force without friction. ``nx`` counts them. Then (z - 1)ⁿ G is fitted, in a
+            from a force without friction; or a list with 0 or 1 for each output, ``[1, 0]`` for a
+            position and a speed. ``nx`` counts them. Then (z - 1)ⁿ G is fitted, in a
             simulation error that is filtered so that it is about white, and D is 0 unless it lowers
             the error by 1 %. Not for a prediction, and not for records in steady state: the system
             has none of its own.
@@ -149,7 +151,9 @@ def estimate_bla(
     clock = time.perf_counter()
     integer("nx", nx, 1)
     integer("max_iter", max_iter, 0)
-    if integrators and refine == "prediction":
+    about = data if isinstance(data, FRF) else as_records(data)[0]
+    counts = integrators_of(integrators, len(about.outputs))
+    if any(counts) and refine == "prediction":
         raise InputError(
             "integrators are for refine='simulation' or 'frequency'; a prediction finds poles near "
             "1 without."
@@ -166,7 +170,7 @@ def estimate_bla(
     if refine != "frequency" and weight is not None:
         raise InputError("weight is that of a response: use refine='frequency'.")
     settings = Settings(refine, weight, offset, feedthrough, max_iter)
-    estimate = partial(_integrating, integrators=integrators) if integrators else _stable
+    estimate = partial(_integrating, counts=counts) if any(counts) else _stable
     model = estimate(data, nx, settings)
     fit = _fit(model)
     notes = fit.notes
@@ -333,25 +337,31 @@ def _stable(
 
 
 def _integrating(
-    data: list[Record] | FRF, nx: int, settings: Settings, integrators: int
+    data: list[Record] | FRF, nx: int, settings: Settings, counts: tuple[int, ...]
 ) -> LinearModel:
     """Fit the differenced output, and put the integrators behind that model."""
     about = data if isinstance(data, FRF) else data[0]
-    nu, ny = len(about.inputs), len(about.outputs)
-    added, refine = integrators * ny, settings.refine
+    nu, integrators, added = len(about.inputs), max(counts), sum(counts)
+    integrates, refine = np.array(counts) > 0, settings.refine
+    mixed = not integrates.all()
     order, records = nx - added, [] if isinstance(data, FRF) else data
     if order < (refine == "frequency"):
         more = ", and a fit to a response takes one more" if refine == "frequency" else ""
         raise InputError(
-            f"nx is {nx}, and {integrators} integrator(s) behind each of {ny} output(s) take "
-            f"{added} states{more}: raise nx."
+            f"nx is {nx}, and integrators behind {int(integrates.sum())} output(s) take {added} "
+            f"states{more}: raise nx."
+        )
+    if mixed and refine == "frequency":
+        raise InputError(
+            "a list of integrators is for refine='simulation'; a response has the same behind each "
+            "output."
         )
     if refine != "frequency" and any(r.start == "periodic" for r in records):
         raise InputError(
             "start is 'periodic', and a system that integrates has no steady state of its own: "
             "use start='estimated'."
         )
-    own, response = settings._replace(feedthrough=True), None
+    own, response = settings._replace(feedthrough=settings.feedthrough or not mixed), None
     if isinstance(data, FRF):
         response = differenced_response(data, integrators)
         if isinstance(own.weight, np.ndarray):
@@ -367,23 +377,26 @@ def _integrating(
     ) -> tuple[LinearModel, list[Record]]:
         if response is not None:
             return _stable(response, order, own, nu * differences, near), []
-        parts = differenced(records, integrators, differences, pole)
+        some = integrates if mixed else None
+        parts = differenced(records, integrators, differences, pole, some)
         if not order:
             return gain(parts, offset=own.offset), parts
         return _stable(parts, order, own, len(parts[0].inputs) - nu, near), parts
 
     differences, pole, models = integrators - 1, 0.0, []
     model, parts = found(differences, own)
-    if settings.feedthrough:
+    if settings.feedthrough and not mixed:
         at_once, _ = found(integrators, own._replace(max_iter=0), near=model)
         # Few systems have a D, and it costs precision at high frequencies.
         if _fit(at_once).rmse < 0.99 * _fit(model).rmse:
             differences = integrators
             model, parts = found(differences, own, near=model)
     while True:
-        whole = integrated(model, about, integrators, differences)
-        models.append(placed(whole, records, added, offset=own.offset) if records else whole)
-        if refine == "frequency" or len(models) == FILTERS:
+        whole = integrated(model, about, integrators, differences, integrates)
+        if records:
+            whole = placed(whole, records, added, integrates, offset=own.offset)
+        models.append(whole)
+        if refine == "frequency" or mixed or len(models) == FILTERS:
             break
         before, errors = pole, [simulation_errors(model, part) for part in parts]
         pole = whitening_pole(errors, integrators, pole)

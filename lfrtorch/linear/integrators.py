@@ -1,4 +1,4 @@
-"""Integrators in a linear model: one or two poles at z = 1, exactly, behind each output.
+"""Integrators in a linear model: one or two poles at z = 1, exactly, behind outputs.
 
 The output of a system that integrates is y = G(z) u with (z - 1)ⁿ G = G₁ + (z - 1) Q₁ + ... +
 (z - 1)ⁿ Qₙ, where G₁ is stable. So the difference v = (z - 1)ⁿ y follows from u by G₁, which the
@@ -13,6 +13,9 @@ moving average 1 - λ z⁻¹ of white noise. All signals are filtered by 1 / (1 
 the error and leaves G₁ as it is: with λ = 0 the fit is to the difference, with λ near 1 to the
 output itself. What the filters hold at the beginning is not known. It adds λᵏ to the output, whose
 size is a parameter.
+
+Some outputs may have one integrator and others none, as a position and a speed do. Only the former
+are differenced then, and nothing is filtered: the errors of both are not alike.
 """
 
 from __future__ import annotations
@@ -22,8 +25,10 @@ from dataclasses import replace
 
 import numpy as np
 import scipy
+from jaxtyping import Bool
 
-from lfrtorch._support.types import Array
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array, Booleans
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearFit, LinearModel, linear_cell
@@ -35,10 +40,32 @@ _SAME_LINE = 1e-9
 """Distance from z = 1 below which a line is the one at 0, where the response is infinite."""
 
 
+def integrators_of(integrators: int | Sequence[int], ny: int) -> tuple[int, ...]:
+    """Return the number of integrators behind each output."""
+    each = np.ravel(np.asarray(integrators, dtype=object)).tolist()
+    each = each * ny if len(each) == 1 else each
+    if len(each) != ny or any(n not in (0, 1, 2) for n in each):
+        raise InputError(
+            f"integrators is {integrators!r}; give 0, 1 or 2, or a list with one of them for each "
+            f"of {ny} output(s)."
+        )
+    if len({*each}) > 1 and 2 in each:
+        raise InputError(
+            f"integrators is {integrators!r}; two are for all outputs or none: give 0 or 1 each."
+        )
+    return tuple(map(int, each))
+
+
 def differenced(
-    records: Sequence[Record], integrators: int, differences: int = 0, pole: float = 0.0
+    records: Sequence[Record],
+    integrators: int,
+    differences: int = 0,
+    pole: float = 0.0,
+    integrates: Bool[Booleans, " ny"] | None = None,
 ) -> list[Record]:
     """Return the records of G₁: the output differenced n times, and all signals filtered.
+
+    If only some outputs integrate, the others stay as they are.
 
     ``differences`` of u follow it as inputs, and what the start of a filter of pole λ adds.
     """
@@ -51,7 +78,8 @@ def differenced(
             found.append(replace(record, y=v, limits=None))
             continue
         u = np.hstack([np.diff(u, times, axis=0)[:T] for times in range(differences + 1)])
-        v, skip = np.diff(v, integrators, axis=0), min(record.skip, T - 1)
+        changes, skip = np.diff(v, integrators, axis=0), min(record.skip, T - 1)
+        v = changes if integrates is None else np.where(integrates, changes, v[:T])
         if pole:
             u, v = (_filtered(signal, integrators, pole) for signal in (u, v))
             starts = np.zeros((T, len(records), integrators))
@@ -166,23 +194,30 @@ def simulation_errors(model: LinearModel, record: Record) -> Array:
 
 
 def integrated(
-    model: LinearModel, like: FRF | Record, integrators: int, differences: int
+    model: LinearModel,
+    like: FRF | Record,
+    integrators: int,
+    differences: int,
+    integrates: Bool[Booleans, " ny"],
 ) -> LinearModel:
-    """Put integrators behind each output of a model; their states come last.
+    """Put integrators behind outputs of a model; their states come last.
 
     The operating point of the input moves to where they stand still, or as close to it as it can.
     """
-    nu, ny = len(like.inputs), len(like.outputs)
+    nu, added = len(like.inputs), int(integrates.sum())
 
     def behind(A: Array, B: Array, C: Array, D: Array, one: float = 1.0) -> list[Array]:
-        B, one_each = B[:, :nu], one * np.eye(ny)
+        B, one_each = B[:, :nu], one * np.eye(added)
+        beside, C = C, C[integrates]
         known = np.pad(D[:, : nu * (differences + 1)], ((0, 0), (0, nu * integrators)))
         gains = [known[:, i * nu : (i + 1) * nu] for i in range(integrators + 1)]
         for gain in gains[:-1]:
-            nothing = np.zeros((len(A), ny))
+            nothing = np.zeros((len(A), added))
             A = np.block([[A, nothing], [C, one_each]])
-            B, C = np.vstack([B, gain]), np.hstack([nothing.T, one_each])
-        return [A, B, C, gains[-1]]
+            B, C = np.vstack([B, gain[integrates]]), np.hstack([nothing.T, one_each])
+        whole = np.pad(beside, ((0, 0), (0, len(A) - beside.shape[1])))
+        whole[integrates] = C
+        return [A, B, whole, np.where(integrates[:, None], gains[-1], D[:, :nu])]
 
     matrices = model.A, model.B, model.C, model.D
     covariance = model.covariance
@@ -194,9 +229,11 @@ def integrated(
         covariance = np.pad(covariance, ((1, 0), (1, 0)))[np.ix_(entries, entries)]
     u_offset, others = model.u_offset[:nu], model.u_offset[nu:]
     constant = model.y_offset - model.D[:, nu:] @ others
-    if constant.any():
+    if constant[integrates].any():
         at_rest = model.D + model.C @ np.linalg.solve(np.eye(model.nx) - model.A, model.B)
-        u_offset = u_offset - np.linalg.lstsq(at_rest[:, :nu], constant, rcond=None)[0]
+        still = at_rest[integrates, :nu]
+        step = -np.linalg.lstsq(still, constant[integrates], rcond=None)[0]
+        u_offset, constant = u_offset + step, constant + at_rest[:, :nu] @ step
     A, B, C, D = behind(*matrices)
     return replace(
         model,
@@ -205,7 +242,7 @@ def integrated(
         C=C,
         D=D,
         u_offset=u_offset,
-        y_offset=np.zeros(ny),
+        y_offset=np.where(integrates, 0.0, constant),
         inputs=like.inputs,
         outputs=like.outputs,
         covariance=covariance,
@@ -213,12 +250,17 @@ def integrated(
 
 
 def placed(
-    model: LinearModel, records: Sequence[Record], integrators: int, *, offset: bool
+    model: LinearModel,
+    records: Sequence[Record],
+    integrators: int,
+    integrates: Bool[Booleans, " ny"],
+    *,
+    offset: bool,
 ) -> LinearModel:
     """Put a model about the operating point of records, with states of unit deviation there."""
     records = [replace(r, start="estimated") if r.start == "periodic" else r for r in records]
     scaler = Scaler.of(records, offset=offset)
-    model = replace(model, y_offset=scaler.y_offset)
+    model = replace(model, y_offset=np.where(integrates, scaler.y_offset, model.y_offset))
     at_rest = [record for record in records if record.start == "zero"]
     if offset and at_rest:  # an estimated start state has the output's offset in it
         error = np.concatenate([simulation_errors(model, r) for r in at_rest]).mean(axis=0)

@@ -102,7 +102,7 @@ class OrderFits:
     def of(cls, data: list[Record] | FRF, most: int, options: Mapping[str, Any]) -> Self | None:
         """Return the fits of ``estimate_bla``, or ``None`` if it has to fit them one by one."""
         given = {name: value for name, value in options.items() if value is not None}
-        if given.get("refine") == "prediction" or given.get("integrators"):
+        if given.get("refine") == "prediction" or np.any(given.get("integrators", 0)):
             return None
         default = "frequency" if isinstance(data, FRF) else default_criterion(data)
         offset, through = given.get("offset", True), given.get("feedthrough", True)

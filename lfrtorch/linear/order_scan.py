@@ -27,6 +27,7 @@ from lfrtorch._support.threads import each_alone
 from lfrtorch._support.types import Array
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
+from lfrtorch.linear.integrators import integrators_of
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_fits import OrderFits, Window, description_length, fitted
 from lfrtorch.linear.requirements import check_length, check_signals, excited_directions
@@ -143,7 +144,7 @@ def scan_orders(
            3 ...
     """
     outputs = data.outputs if isinstance(data, FRF) else as_records(data)[0].outputs
-    orders = _rising(orders, options.get("integrators", 0) * len(outputs))
+    orders = _rising(orders, sum(integrators_of(options.get("integrators", 0), len(outputs))))
     none = isinstance(validation, list | tuple) and not validation
     judges = [] if none else [*map(with_window, as_records(validation))]
     records = [] if isinstance(data, FRF) else [without_coordinates(r) for r in as_records(data)]

@@ -7,6 +7,9 @@ belongs to a resonance and changes quickly. A fit of first order tells how soon 
     V + a V / jω = (b + jω c) U,
 
 over a few lines more: its time constant is 1 / a.
+
+An output that integrates another output, as a position does a speed, needs no spectrum: its change
+over a stretch is a multiple of the other's integral.
 """
 
 from __future__ import annotations
@@ -32,6 +35,9 @@ _COHERENT, _REAL, _UPPER, _EVEN = 0.95, 25.0, 0.4, 0.6
 # of the lowest lines, and c is at most LAG of it there.
 _LINES, _FITTED, _FORGETS, _GAIN, _LAG = 12, 0.75, 3.0, 0.5, 0.3
 
+# A change of an output over one of so many stretches has this correlation with its rate's integral.
+_STRETCHES, _ALIKE = 200, 0.95
+
 
 def integrators(u: Array, y: Array) -> int:
     """Return how many integrators, 0, 1 or 2, lie between inputs (T, nu) and an output (T,)."""
@@ -51,6 +57,23 @@ def integrators(u: Array, y: Array) -> int:
         if integrates if fitted else _even(U, V, max(first, 2)):
             return n
     return 0
+
+
+def rates(y: Array) -> list[int | None]:
+    """Return for each output of y (T, ny) the number of that which is its rate, if there is one."""
+    T, ny = y.shape
+    if T < _SHORTEST:
+        return [None] * ny
+    m = max(1, T // _STRETCHES)
+    between = (y[1:] + y[:-1]) / 2
+    integral = np.vstack([np.zeros(ny), np.cumsum(between - between.mean(axis=0), axis=0)])
+    change, area = (s[m:] - s[:-m] for s in (y, integral))
+    change, area = (s - s.mean(axis=0) for s in (change, area))
+    sizes = np.linalg.norm(change, axis=0)[:, None] * np.linalg.norm(area, axis=0)
+    alike = np.abs(change.T @ area) / np.maximum(sizes, 1e-300)
+    np.fill_diagonal(alike, 0.0)
+    best = alike.argmax(axis=1)
+    return [int(j) if alike[i, j] > _ALIKE else None for i, j in enumerate(best)]
 
 
 def _spectrum(signals: Array, T: int) -> Complex:

@@ -11,7 +11,7 @@ import scipy
 from lfrtorch._support.types import Array
 from lfrtorch.records import Record, as_records
 from lfrtorch.survey.causality import TwoSidedResponse, two_sided_response
-from lfrtorch.survey.integration import integrators
+from lfrtorch.survey.integration import integrators, rates
 from lfrtorch.survey.measurement import Survey, survey_measurement
 from lfrtorch.survey.mechanics import reacting, rubs
 from lfrtorch.survey.outliers import input_outliers, output_outliers
@@ -97,8 +97,11 @@ def notes_on(
             r.u[scored], r.y[scored], r.fs, inputs=r.inputs, outputs=r.outputs, period=r.period
         )
         for kind, text in examine(found, r.u[scored], r.y[scored], skipped=r.skip, given=known):
-            if kind.startswith("integrates") and r.start == "estimated":
+            one, other = kind.startswith("integrates"), kind.startswith(("chain", "rate"))
+            if one and r.start == "estimated":
                 continue  # a fit says it, if its model does not integrate
+            if other and (r.start == "measured" or np.any(known.get("integrators", 0))):
+                continue
             by_kind.setdefault(kind, []).append((r.name, text))
     sentences = []
     for (name, text), *more in by_kind.values():
@@ -271,7 +274,20 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
                 "swapped? (Or a controller makes the input from the output.)",
             )
             return
-    counts = [integrators(u, channel) for channel in y.T]
+    rate = rates(y)
+    counts = [integrators(u, channel) or int(rate[i] is not None) for i, channel in enumerate(y.T)]
+    # Two integrators are behind all outputs or none.
+    some = counts if min(counts) else [min(count, 1) for count in counts]
+    asked = counts[0] if len({*counts}) == 1 else f"[{','.join(map(str, some))}]"
+    names = [output.channel.name for output in found.outputs]
+    chain = next(((i, j) for i, j in enumerate(rate) if j is not None and counts[j]), None)
+    if chain is not None:
+        first, second = (names[i] for i in chain)
+        yield Note(
+            "chain",
+            f"'{first}' integrates '{second}', which integrates, too: use start='measured', as the "
+            "outputs tell the states, and horizon=N, the samples ahead that count.",
+        )
     changes = ["feedthrough=False"] if given.get("feedthrough", True) else []
     if given.get("refine") != "prediction" and not any(counts):
         changes.append("refine='prediction' or noise='innovation'")
@@ -287,11 +303,13 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
     for i, output in enumerate(found.outputs):
         pairs = {j: pair for (k, j), pair in between.items() if k == i}
         name, integrates = output.channel.name, counts[i]
-        if integrates:
-            known = "" if given.get("integrators") else f"integrators={integrates} and "
+        if integrates and chain is None:
+            known = "" if np.any(given.get("integrators", 0)) else f"integrators={asked} and "
+            j = rate[i]
+            kind, behind = ("integrates", "") if j is None else ("rate", f" output '{names[j]}'")
             yield Note(
-                f"integrates {name}",
-                f"output '{name}' integrates: use {known}start='estimated'; "
+                f"{kind} {name}",
+                f"output '{name}' integrates{behind}: use {known}start='estimated'; "
                 "it has no steady state.",
             )
         force = next((j for j in range(u.shape[1]) if rubs(u[:, j], y[:, i])), None)

@@ -68,6 +68,18 @@ def test_a_fit_keeps_them(count, options, trainer):
     assert np.sum(np.abs(np.linalg.eigvals(model.lfr.cell.A.detach()) - 1) < 1e-6) == count
 
 
+def test_a_position_keeps_its_own_beside_a_speed():
+    whole = axis(1)
+    speed = np.diff(whole.y[:, 0], append=whole.y[-1:, 0].tolist())
+    record = Record(whole.u[:-1], np.column_stack([whole.y[:-1, 0], speed[:-1]]), start="estimated")
+    model = initialise(estimate_bla(record, 2, integrators=[1, 0]), record, nz=1, nw=1, nn=4)
+    before, error = bits(model, 1), rmse(record, model.simulate(record))
+    fit(model, record, trainer=LevenbergMarquardt(max_iter=15))
+    assert bits(model, 1) == before
+    assert integrating_states(model.lfr.cell).tolist() == [False, True]
+    assert rmse(record, model.simulate(record)) < 0.5 * error
+
+
 def test_a_shift_stays_for_good():
     record, model = axis(1), started(1)
     fit(model, record, trainer=LevenbergMarquardt(max_iter=10))

@@ -64,6 +64,67 @@ def test_a_system_that_integrates_is_recovered(integrators: Literal[1, 2], start
     np.testing.assert_allclose(model.simulate(data), data.y, atol=1e-6)
 
 
+def carriage(*, load: float = 0.0, noise: float = 0.0, **more: Any) -> Record:
+    """Position and speed under a force that also tilts what measures the speed."""
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(T)
+    speed = lfilter([0.0, 0.1], LAG, u)
+    y = np.column_stack([lfilter([0.0, 0.1], [1.0, -1.0], speed) + 3.0, speed + 0.05 * u])
+    return Record(u + load, y + noise * rng.standard_normal(y.shape), FS, **more)
+
+
+@pytest.mark.parametrize("start", ["zero", "estimated"])
+@pytest.mark.parametrize("load", [0.0, 2.0])
+def test_a_position_integrates_beside_its_speed(start, load: float):
+    data = carriage(load=load, start=start)
+    model = estimate_bla(data, 2, integrators=[1, 0])
+    np.testing.assert_allclose(np.sort(model.poles.real), [0.9, 1.0], atol=EXACT)
+    assert np.sum(model.poles == 1.0) == 1
+    np.testing.assert_allclose(model.simulate(data), data.y, atol=1e-6)
+    np.testing.assert_allclose(model.D.ravel(), [0.0, 0.05], atol=EXACT)
+    assert model.u_offset == pytest.approx(load, abs=EXACT)
+
+
+def test_the_same_number_behind_each_output_is_one_number():
+    one, each = (estimate_bla(record(noise=0.1), 2, integrators=n) for n in (1, [1]))
+    assert np.array_equal(one.A, each.A)
+    twice = Record(record().u, np.hstack([record().y, record(noise=0.1).y]), FS)
+    one, each = (estimate_bla(twice, 3, integrators=n, max_iter=0) for n in (1, [1, 1]))
+    assert np.array_equal(one.A, each.A)
+
+
+def test_standard_errors_beside_an_output_that_does_not_integrate():
+    model = estimate_bla(carriage(noise=0.01, start="estimated"), 2, integrators=[1, 0])
+    assert model.covariance is not None
+    parts = [m.size for m in (model.A, model.B, model.C, model.D)]
+    assert model.covariance.shape == (sum(parts), sum(parts))
+    _, _, of_C, of_D = np.split(np.sqrt(np.diag(model.covariance)), np.cumsum(parts)[:-1])
+    np.testing.assert_array_equal(of_C.reshape(model.C.shape) > 0, [[False, False], [True, False]])
+    np.testing.assert_array_equal(of_D > 0, [False, True])
+
+
+@pytest.mark.parametrize(
+    ("integrators", "message", "more"),
+    [
+        ([2, 0], "two are for all outputs or none", {}),
+        ([1, 0, 0], "a list with one of them for each of 2 output", {}),
+        ([1, 3], "give 0, 1 or 2", {}),
+        ([1, 0], "a response has the same behind each output", {"refine": "frequency"}),
+        ([0, 1], "integrators are for refine", {"refine": "prediction"}),
+    ],
+)
+def test_lists_that_cannot_be(integrators, message: str, more: dict[str, Any]):
+    with pytest.raises(ValueError, match=message):
+        estimate_bla(carriage(), 2, integrators=integrators, **more)
+
+
+def test_orders_that_hold_them_are_scanned():
+    data = carriage(noise=0.01)
+    scan = scan_orders(data, [1, 2, 3], validation=data, integrators=[1, 0])
+    assert scan.orders[0] <= 2
+    assert all(np.sum(model.poles == 1.0) == 1 for model in scan.models)
+
+
 def in_motion(constant: float, samples: int) -> tuple[Record, Array, Array]:
     """A record cut in mid-motion, about a constant input, its noise, and the response."""
     begin, b, a = 300, [0.0, 0.3, 0.1], np.poly([1.0, 0.98])
@@ -240,6 +301,7 @@ def test_orders_below_the_integrators(tmp_path):
     ("options", "said"),
     [
         ({"integrators": 3}, "give 0, 1 or 2"),
+        ({"integrators": [1, 0]}, "a list with one of them for each of 1 output"),
         ({"integrators": 2, "nx": 1}, "raise nx"),
         ({"integrators": 1, "refine": "prediction"}, "integrators are for refine"),
         ({"integrators": 1, "nx": 1, "refine": "frequency"}, "a fit to a response takes one more"),

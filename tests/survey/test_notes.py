@@ -264,6 +264,38 @@ def test_integrating_output(u):
     assert set(both) == {"integrates"}
 
 
+def carriage(u: Array, *, friction: float = 0.02) -> Array:
+    """Position and speed of a carriage under a force, from rest, with noise."""
+    speed = lfilter([0, 1], [1, friction - 1], u)
+    noise = NOISE * np.random.default_rng(1).standard_normal((len(u), 2))
+    return np.column_stack([lfilter([0, 1], [1, -1], speed), speed]) + noise
+
+
+def test_an_output_that_integrates_another(u):
+    said = found(u, carriage(u), outputs=[Channel("place"), Channel("speed")])
+    assert {*said} == {"rate"}
+    assert said["rate"].startswith("output 'place' integrates output 'speed'")
+    assert "integrators=[1,0]" in said["rate"]
+    lags = np.column_stack([lag(lag(u)), lag(u)])  # the first follows the second, and forgets
+    assert found(u, lags) == {}
+
+
+def test_a_chain_of_outputs_tells_the_states(u):
+    slope = lfilter([0, 1], [1, -0.98], u)
+    turned = np.cumsum(slope)
+    said = found(u, np.column_stack([np.cumsum(turned), turned, slope]))
+    assert {*said} == {"chain"}
+    assert "use start='measured', as the outputs tell the states, and horizon=N" in said["chain"]
+
+
+def test_what_is_settled_needs_no_advice_on_integrators(u):
+    record = Record(u, carriage(u))
+    assert "integrators=[1,0]" in notes_on(record)[0]
+    assert "integrators=[1,0]" in notes_on(replace(record, start="estimated"))[0]
+    assert notes_on(replace(record, start="measured")) == []
+    assert notes_on(record, given={"integrators": [1, 0]}) == []
+
+
 @pytest.mark.parametrize("constants", [5, 10, 50])
 def test_a_slow_system_does_not_integrate(constants, u):
     """It forgets several times in the record."""
