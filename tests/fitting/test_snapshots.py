@@ -172,6 +172,18 @@ def test_ends_as_without_interruption(tmp_path: Path):
     assert outcome(resumed) == outcome(whole)
 
 
+def test_minibatches_end_as_without_interruption(tmp_path: Path):
+    """And their steps are more than the one of an epoch over all records."""
+    (train, unused), validation = records(("zero", "estimated"))
+    data, optimiser = ([train, unused] * 32, validation), Adam(max_iter=4, learning_rate=1e-2)
+    whole = run(starts(1), data, trainer=optimiser)
+    cut = run(starts(1), data, tmp_path, 3, trainer=optimiser)
+    assert (cut.reason, cut.iterations) == (Reason.INTERRUPTED, 2)
+    assert outcome(run(starts(1), data, tmp_path, trainer=optimiser)) == outcome(whole)
+    few = run(starts(1), ([train, unused], validation), trainer=optimiser)
+    assert whole.history[-1].train < few.history[-1].train < few.history[0].train
+
+
 def test_seconds_before_an_interruption_count(tmp_path: Path):
     data, optimiser = records(["zero"], "zero"), LevenbergMarquardt(max_iter=6)
     first = run(starts(1), data, tmp_path, stop=4, trainer=optimiser)
