@@ -8,8 +8,9 @@ belongs to a resonance and changes quickly. A fit of first order tells how soon 
 
 over a few lines more: its time constant is 1 / a.
 
-An output that integrates another output, as a position does a speed, needs no spectrum: its change
-over a stretch is a multiple of the other's integral.
+An output that is the integral of another output, as a position is of a speed, shows that without a
+spectrum: its change over a stretch is a multiple of the other's integral. It is so of a mass on a
+spring, too. Without a spring the response to the inputs grows towards the lowest frequencies.
 """
 
 from __future__ import annotations
@@ -37,6 +38,13 @@ _LINES, _FITTED, _FORGETS, _GAIN, _LAG = 12, 0.75, 3.0, 0.5, 0.3
 
 # A change of an output over one of so many stretches has this correlation with its rate's integral.
 _STRETCHES, _ALIKE = 200, 0.95
+
+# Place, speed and acceleration of any mass are so many; more are those of one without a spring.
+_LINKED = 3
+
+# Power of the response in the first band over that in the second: 28 of an integrator under a white
+# input, 1 of a spring.
+_BANDS, _GROWS = (slice(1, 5), slice(5, 17)), 14.0
 
 
 def integrators(u: Array, y: Array) -> int:
@@ -74,6 +82,30 @@ def rates(y: Array) -> list[int | None]:
     np.fill_diagonal(alike, 0.0)
     best = alike.argmax(axis=1)
     return [int(j) if alike[i, j] > _ALIKE else None for i, j in enumerate(best)]
+
+
+def grows(u: Array, y: Array) -> bool:
+    """Return whether the response of an output (T,) to inputs (T, nu) grows as an integrator's."""
+    T, u = len(y), u[:, np.ptp(u, axis=0) > 0]
+    if T < _SHORTEST or not u.size:
+        return False
+    by_u, by_y = (
+        (np.abs(_spectrum(s / np.maximum(s.std(axis=0), 1e-300), T)) ** 2).sum(axis=1)
+        for s in (u, y[:, None])
+    )
+    low, high = (by_y[band].sum() / max(by_u[band].sum(), 1e-300) for band in _BANDS)
+    return bool(low > _GROWS * high)
+
+
+def chain(rate: list[int | None]) -> tuple[int, int] | None:
+    """Return an output and its rate, if that is the integral of one that is an integral, too."""
+    for i in range(len(rate)):
+        linked: list[int] = [i]
+        while (j := rate[linked[-1]]) is not None and j not in linked:
+            linked.append(j)
+        if len(linked) > _LINKED:
+            return linked[0], linked[1]
+    return None
 
 
 def _spectrum(signals: Array, T: int) -> Complex:

@@ -11,7 +11,7 @@ import scipy
 from lfrtorch._support.types import Array
 from lfrtorch.records import Record, as_records
 from lfrtorch.survey.causality import TwoSidedResponse, two_sided_response
-from lfrtorch.survey.integration import integrators, rates
+from lfrtorch.survey.integration import chain, grows, integrators, rates
 from lfrtorch.survey.measurement import Survey, survey_measurement
 from lfrtorch.survey.mechanics import reacting, rubs
 from lfrtorch.survey.outliers import input_outliers, output_outliers
@@ -275,14 +275,18 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
             )
             return
     rate = rates(y)
-    counts = [integrators(u, channel) or int(rate[i] is not None) for i, channel in enumerate(y.T)]
+    counts = [
+        integrators(u, channel) or int(rate[i] is not None and grows(u, channel))
+        for i, channel in enumerate(y.T)
+    ]
     # Two integrators are behind all outputs or none.
     some = counts if min(counts) else [min(count, 1) for count in counts]
     asked = counts[0] if len({*counts}) == 1 else f"[{','.join(map(str, some))}]"
     names = [output.channel.name for output in found.outputs]
-    chain = next(((i, j) for i, j in enumerate(rate) if j is not None and counts[j]), None)
-    if chain is not None:
-        first, second = (names[i] for i in chain)
+    both = ((i, j) for i, j in enumerate(rate) if j is not None and counts[i] and counts[j])
+    linked = next(both, chain(rate))
+    if linked is not None:
+        first, second = (names[i] for i in linked)
         yield Note(
             "chain",
             f"'{first}' integrates '{second}', which integrates, too: use start='measured', as the "
@@ -303,7 +307,7 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
     for i, output in enumerate(found.outputs):
         pairs = {j: pair for (k, j), pair in between.items() if k == i}
         name, integrates = output.channel.name, counts[i]
-        if integrates and chain is None:
+        if integrates and linked is None:
             known = "" if np.any(given.get("integrators", 0)) else f"integrators={asked} and "
             j = rate[i]
             kind, behind = ("integrates", "") if j is None else ("rate", f" output '{names[j]}'")

@@ -280,11 +280,24 @@ def test_an_output_that_integrates_another(u):
     assert found(u, lags) == {}
 
 
+@pytest.mark.parametrize(("omega", "damping"), [(0.3, 0.2), (0.05, 0.1), (0.01, 1.0)])
+def test_a_place_on_a_spring_does_not_integrate(u, omega: float, damping: float):
+    """It is the integral of its speed all the same."""
+    pole = omega * (-damping + 1j * np.sqrt(1 - damping**2))
+    a = np.poly(np.exp([pole, np.conj(pole)])).real
+    signals = [lfilter(b, a, u) for b in ([0, 0, 1], [0, 1, -1], [1, -2, 1])]
+    said = found(u, np.column_stack(signals))
+    assert not {"rate", "chain", "integrates"} & {*said}
+
+
 def test_a_chain_of_outputs_tells_the_states(u):
     slope = lfilter([0, 1], [1, -0.98], u)
     turned = np.cumsum(slope)
     said = found(u, np.column_stack([np.cumsum(turned), turned, slope]))
     assert {*said} == {"chain"}
+    wild = np.random.default_rng(2).standard_normal(T)  # as if a controller made the input
+    held = np.column_stack([np.cumsum(np.cumsum(turned)), np.cumsum(turned), turned, slope])
+    assert "chain" in found(wild, held)
     assert "use start='measured', as the outputs tell the states, and horizon=N" in said["chain"]
 
 
