@@ -97,10 +97,10 @@ def notes_on(
             r.u[scored], r.y[scored], r.fs, inputs=r.inputs, outputs=r.outputs, period=r.period
         )
         for kind, text in examine(found, r.u[scored], r.y[scored], skipped=r.skip, given=known):
-            one, other = kind.startswith("integrates"), kind.startswith(("chain", "rate"))
-            if one and r.start == "estimated":
+            if kind.startswith("integrates") and r.start == "estimated":
                 continue  # a fit says it, if its model does not integrate
-            if other and (r.start == "measured" or np.any(known.get("integrators", 0))):
+            settled = r.start == "measured" or np.any(known.get("integrators", 0))
+            if kind.startswith(("chain", "rate")) and settled:
                 continue
             by_kind.setdefault(kind, []).append((r.name, text))
     sentences = []
