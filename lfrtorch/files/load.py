@@ -116,9 +116,10 @@ def load_records(
         start: ``"zero"`` (at rest), ``"estimated"`` (amid the measurement), ``"measured"`` (the
             outputs are the states), or ``"periodic"``: every record is cut to whole periods in
             steady state. Default: a record of whole periods
-            that has settled from its first sample on is periodic. Other records are from rest,
-            unless linear models of most of the first three that train validate clearly better with
-            an estimated start; a note has both errors. With ``test="all"`` all are from rest.
+            that has settled from its first sample on is periodic. Other records have an estimated
+            start, whose middle is rest, unless their linear models validate clearly better from
+            rest; a note has both errors of the first three. If all of these are from rest, the
+            others that train are, too. With ``test="all"`` all are from rest.
         period: samples of one period of the inputs; ``"auto"`` finds it, ``None`` is none.
         skip: samples at the beginning of every record that are left out of cost and score.
             Default: of records from rest the periods that the output takes to settle, or 5 % if
@@ -181,8 +182,8 @@ def load_records(
             "for training, for example 0.2 and 0.2."
         )
     train = [whole.record for whole in left]
-    if reader.begin_in_motion(train):
-        tests, chosen, train = map(reader.in_motion, (tests, chosen, train))
+    reader.find_rest(train)
+    tests, chosen, train = map(reader.in_motion, (tests, chosen, train))
     parts: dict[str, list[Record]] = {"train": [], "validation": chosen, "test": tests}
     short = None
     for whole, own in zip(left, train, strict=True):
@@ -275,27 +276,28 @@ class _Reader:
         self.all += found
         return found
 
-    def begin_in_motion(self, train: Sequence[Record]) -> bool:
-        """Whether the records that are not decided yet begin in motion, as most that train do."""
-        moving = []
-        for record in [record for record in train if record.name in self._open][:_TRIED]:
+    def find_rest(self, train: Sequence[Record]) -> None:
+        """Decide which records that train begin at rest, each by itself as far as it is tried."""
+        resting, undecided = list[str](), [r for r in train if r.name in self._open]
+        for record in undecided[:_TRIED]:
             seen = record[: record.samples - round(record.samples * self.unseen)]
             try:
                 trial = try_starts(seen)
             except InputError:
                 self.note(record.name, "start is zero: no linear model tells how it begins")
-                moving.append(False)
+                resting.append(record.name)
             else:
                 self.note(record.name, str(trial))
-                moving.append(trial.chosen == "estimated")
-        in_motion = 2 * sum(moving) > len(moving)
-        if len(self._open) > 1 and moving:
-            start = "estimated" if in_motion else "zero"
-            self.note("", f"start is {start} for all records, as for most of these {len(moving)}")
-        return in_motion
+                resting += [record.name] * (trial.chosen == "zero")
+        if len(undecided) > _TRIED:
+            all_rest = len(resting) == _TRIED
+            resting += [r.name for r in undecided[_TRIED:]] * all_rest
+            start = "zero" if all_rest else "estimated"
+            self.note("", f"start is {start} for the records after the first {_TRIED}, too")
+        self._open -= {*resting}
 
     def in_motion(self, records: Sequence[Record]) -> list[Record]:
-        """Records with an estimated start where nothing else is decided."""
+        """Records with an estimated start where rest is not decided."""
         skip = self.skip or 0
         return [
             replace(record, start="estimated", skip=skip) if record.name in self._open else record

@@ -726,32 +726,35 @@ def test_a_record_in_motion_has_an_estimated_start(tmp_path):
 
 
 @pytest.mark.numeric
-def test_a_record_from_rest_is_said_to_be(tmp_path):
+def test_a_record_from_rest_has_an_estimated_start_that_does_no_harm(tmp_path):
     cut_out(tmp_path / "a.csv", 0)
     data = load_records(tmp_path / "a.csv", **AUTO, test=0)
-    assert starts(data) == [("zero", 20), ("zero", 320)]
-    assert data.notes[0].endswith("start is zero")
+    assert starts(data) == [("estimated", 0), ("estimated", 320)]
+    assert data.notes[0].endswith("no harm at rest either: start is estimated")
 
 
 @pytest.mark.parametrize(
-    ("resting", "start"), [(["run1", "run3"], ("estimated", 0)), (["run0", "run1"], ("zero", 10))]
+    ("resting", "others"), [(["run1", "run3"], "estimated"), (["run0", "run1", "run2"], "zero")]
 )
-def test_records_begin_as_most_of_the_first_that_train(
-    tmp_path, signals, monkeypatch, resting: list[str], start: tuple[str, int]
+def test_each_record_begins_by_itself_and_those_not_tried_as_all_that_are(
+    tmp_path, signals, monkeypatch, resting: list[str], others: str
 ):
     tried = []
 
     def trial(record):
         tried.append(record.name)
-        return StartTrial(1.0, 1.0 if record.name in resting else 0.5, 2.0)
+        return StartTrial(0.5 if record.name in resting else 1.0, 1.0)
 
     monkeypatch.setattr(load, "try_starts", trial)
     for name in ("run0", "run1", "run2", "run3", "run4", "test"):
         write(tmp_path / f"{name}.csv", signals)
     use = USE | {"start": "auto", "validation": 1, "test": tmp_path / "test.csv"}
     data = load_records(tmp_path / "run*.csv", **use)
-    assert starts(data) == [start] * 6
-    assert data.notes[-1] == f"start is {start[0]} for all records, as for most of these 3"
+    wanted = ["zero" if f"run{i}" in resting else "estimated" for i in range(3)]
+    assert [r.start for r in data.train] == [*wanted, others]
+    # What does not train tells by itself where it begins, in the samples that a score leaves out.
+    assert [r.start for r in (*data.validation, *data.tests)] == ["estimated", "estimated"]
+    assert data.notes[-1] == f"start is {others} for the records after the first 3, too"
     assert tried == ["run0", "run1", "run2"]
 
 
