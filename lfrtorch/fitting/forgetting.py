@@ -1,0 +1,165 @@
+"""Whether a model forgets where it began: outputs from several start states meet.
+
+A model may have rests, or ways to move, that no data have shown. It then follows the data from the
+start state that was fitted, in stretches without measurements too, and from another one it stays
+elsewhere for ever. So the training inputs are simulated from the record's own start, from rest, and
+from random states of the second moment that the states have there; what counts is the largest rms
+distance of the outputs from those of the own start, in the last third of a record, over the
+outputs' deviation.
+
+A lightly damped system forgets slowly, and one that integrates never does. So a model may be as
+forgetful as the linear model of the same data. A system may have several rests, as a toggle or a
+pendulum that swings over has: where the trajectories that stay apart end among states that the
+records have visited, the model is right to remember.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from lfrtorch._support.arguments import typed
+from lfrtorch._support.tables import percent
+from lfrtorch.engine.simulation import simulate
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
+from lfrtorch.records import Record, as_records
+
+LIMIT = 0.02
+"""Distance, over the outputs' deviation, up to which outputs have met."""
+
+_RANDOM = 12  # start states, beside the record's own and rest
+
+_LONGEST = 10_000  # samples of a record that are simulated
+
+_SAMPLES = 60_000  # of all records together: the longest come first
+
+_SLOWER = 2.0  # distance over the linear model's that is no fault
+
+_NEAR = 0.5  # deviations of the states within which a state was visited, for each state's root
+_LOOKED_AT = 200  # states at the end of a trajectory that is apart
+
+
+class Memory(NamedTuple):
+    """What outputs still show of the start state in the last third of the training records.
+
+    Args:
+        apart: largest rms distance of outputs from several starts, over the outputs' deviation;
+            infinite if the model diverges from one of them.
+        linear: the same of the linear model; 0 if there is none.
+        visited: whether trajectories that stay apart end at states that the records have visited:
+            the system has several rests.
+    """
+
+    apart: float
+    linear: float = 0.0
+    visited: bool = False
+
+    @property
+    def fades(self) -> bool:
+        """Whether the outputs meet, as far as the linear model's do."""
+        return self.apart <= max(LIMIT, _SLOWER * self.linear)
+
+    @property
+    def right(self) -> bool:
+        """Whether the model forgets, or remembers what the records have shown."""
+        return self.fades or self.visited
+
+    def __str__(self) -> str:
+        """A sentence."""
+        if self.fades:
+            slow = ", as slowly as the linear model" if self.apart > LIMIT else ""
+            return f"The model forgets where it began{slow}."
+        if not np.isfinite(self.apart):
+            return "The model runs away from some start states among those of its data."
+        text = (
+            f"from other start states the output stays {percent(self.apart)} of its deviation apart"
+        )
+        if self.visited:
+            return f"The model has several rests, all of which the records visit: {text}."
+        return f"The model does not forget where it began: {text}, where the records never were."
+
+
+@typed("model", "records", "linear")
+def forgets(
+    model: Model, records: Record | Sequence[Record], linear: LinearModel | Model | None = None
+) -> Memory:
+    """How far a model forgets where it began, on the inputs of its training records.
+
+    Args:
+        model: what is simulated.
+        records: those that it was fitted to.
+        linear: the linear model of the same records, or the start of the fit: a model may be as
+            slow. Default: none.
+
+    Example:
+        >>> memory = lfrtorch.forgets(model, record, bla)
+        >>> memory.right, memory.apart < 1e-3
+        (True, True)
+    """
+    given = sorted(as_records(records), key=lambda record: -record.samples)
+    seen, samples = list[Record](), 0
+    for record in given:
+        if not seen or samples + min(record.samples, _LONGEST) <= _SAMPLES:
+            seen.append(record)
+            samples += min(record.samples, _LONGEST)
+    scale = np.concatenate([record.y for record in given]).std(axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    apart, ends, paths = _apart(model, seen, scale)
+    slow = 0.0
+    if linear is not None and not apart <= LIMIT:
+        as_model = linear.to_model() if isinstance(linear, LinearModel) else linear
+        slow, *_ = _apart(as_model, seen, scale)
+    found = Memory(apart, slow)
+    if found.fades or not np.isfinite(apart):
+        return found
+    return found._replace(visited=_visited(ends, paths))
+
+
+def _apart(
+    model: Model, records: Sequence[Record], scale: np.ndarray
+) -> tuple[float, list[Tensor], list[Tensor]]:
+    """Return the largest distance, the ends of all that stays apart, and the records' own paths."""
+    most, ends, paths = 0.0, list[Tensor](), list[Tensor]()
+    generator = torch.Generator().manual_seed(0)
+    cell = model.lfr.cell
+    for record in records:
+        own = model.signals(record).x[0]
+        T = min(record.samples, _LONGEST)
+        own = own[: T + 1]
+        u = torch.as_tensor(model.scaler.normalise_u(record.u[:T])).to(cell.A)
+        if not torch.isfinite(own).all():
+            return np.inf, [], []
+        moment = (own.mT @ own / len(own)).double()
+        values, axes = torch.linalg.eigh(moment)
+        root = axes * values.clamp_min(0.0).sqrt()
+        # Half of them as the states are correlated, and half as if they were not.
+        draws = torch.randn(2, _RANDOM // 2, cell.nx, generator=generator, dtype=torch.float64)
+        draws = torch.cat([draws[0] @ root.mT, draws[1] * moment.diagonal().sqrt()])
+        starts = torch.cat([own[:1], torch.zeros_like(own[:1]), draws.to(own)]).to(cell.A)
+        paths.append(own.double())
+        for v in (u, u.flip(0)):
+            found = simulate(cell, v.expand(len(starts), -1, -1), starts)
+            y = (found.y[:, 2 * T // 3 :].double().cpu().numpy()) * model.scaler.y_scale / scale
+            with np.errstate(over="ignore", invalid="ignore"):
+                distance = np.sqrt(np.mean((y - y[0]) ** 2, axis=(1, 2)))
+            distance = np.where(np.isfinite(distance), distance, np.inf)
+            most = max(most, float(distance.max()))
+            late = found.x[:, 2 * T // 3 :].double().cpu()
+            ends += [late[i][-_LOOKED_AT:] for i in np.flatnonzero(distance > LIMIT)]
+    return most, ends, paths
+
+
+def _visited(ends: Sequence[Tensor], paths: Sequence[Tensor]) -> bool:
+    """Whether the ends of trajectories are among the states of the records' own."""
+    visited = np.concatenate([path.numpy() for path in paths])
+    deviation = visited.std(axis=0)
+    deviation = np.where(deviation > 0.0, deviation, 1.0)
+    tree = KDTree(visited / deviation)
+    near = _NEAR * np.sqrt(visited.shape[1])
+    return all(np.quantile(tree.query(end.numpy() / deviation)[0], 0.9) <= near for end in ends)
