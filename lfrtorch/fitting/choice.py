@@ -45,6 +45,7 @@ from lfrtorch._support.types import Array, Integers
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.folds import Fold, as_folded, folds
+from lfrtorch.fitting.forgetting import forgets
 from lfrtorch.fitting.side_by_side import any_of
 from lfrtorch.fitting.trainer import Stop, StoppedError
 from lfrtorch.least_squares.guarantee import Name
@@ -76,7 +77,11 @@ _NEAR = 1.2
 _SMALL = ({"nz": 1, "nw": 1, "nn": 4, "degree": 3}, {"nz": 2, "nw": 2, "nn": 8, "degree": 3})
 """Sizes that are always tried."""
 
-_TINY = 1e-30  # a linear model that is exact has a ratio to it, too
+_FLOOR = 1e-6  # error over the outputs' deviation below which models are alike
+
+_DENSEST = 0.5  # net parameters for each scored output, at most
+
+_WORSE = 1.3  # error over the best of the larger ridges; twice in a row, smaller ones are not tried
 
 _GAIN = 0.98  # error over the linear model's, or the last best one's, that larger sizes need
 
@@ -92,6 +97,7 @@ class Candidate:
         ratio: rms error in what was left out over that of the linear model.
         squares: sums of the squared relative errors in the blocks of each stretch, (folds, B).
         outputs: what simulates each stretch (samples, ny), physical units.
+        remembers: whether no fit without some stretch forgets where it began; it is refused then.
     """
 
     sizes: Sizes
@@ -100,6 +106,7 @@ class Candidate:
     ratio: float
     squares: Array = field(repr=False)
     outputs: Sequence[Array] = field(repr=False)
+    remembers: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +230,8 @@ def choose_sizes(
     Raises:
         ValueError: records too short to be cut, or no model that is stable on them.
         LfrtorchError: ``linear`` or ``start`` returned no model.
-        StoppedError: by Ctrl-C or ``stop``: there is no choice yet.
+        StoppedError: by Ctrl-C or ``stop`` before the first sizes were tried; later the best of
+            those that were tried are chosen.
 
     Example:
         >>> def start(bla, train, sizes, seed):
@@ -245,22 +253,26 @@ def choose_sizes(
     given = {} if given is None else dict(given)
     base, tried = study.best_linear(orders), list[Candidate]()
     begun = set[tuple[int, ...]]()
-    budget = _budget(study.rows)
+    budget = left = _budget(study.rows)
 
     def attempt(sizes: Sizes) -> None:
-        nonlocal budget
+        nonlocal left
         key = tuple(sizes.values())
-        if key in begun or not study.has_order(sizes["nx"]):
+        if key in begun or (tried and left <= 0.0) or not study.has_order(sizes["nx"]):
             return
         begun.add(key)
         since = time.perf_counter()
         found = study.candidates(sizes, start, seed, base.total)
-        budget -= study.work(found[0].parameters_net if found else 0)
+        left -= study.work(found[0].parameters_net if found else 0) * len(found) / len(path)
         tried.extend(found)
         best = min((c.ratio for c in found), default=nan)
         text = ", ".join(f"{name} {size}" for name, size in sizes.items())
-        error = f"{percent(best)} of the linear model's error" if isfinite(best) else "diverges"
-        watch(f"sizes: {text}: {error}, {quantity(time.perf_counter() - since, 's')}")
+        error = (
+            f"{percent(best)} of the linear model's error" if isfinite(best) else _no_error(found)
+        )
+        seconds = quantity(time.perf_counter() - since, "s")
+        done = percent(min(1.0, 1.0 - left / budget)) if budget else "all"
+        watch(f"sizes: {text}: {error}, {seconds}, {done} of the search's work")
 
     def leader() -> Candidate | None:
         finite = [c for c in tried if isfinite(c.ratio)]
@@ -268,17 +280,27 @@ def choose_sizes(
         return finite[int(ratios.argmin())] if finite else None
 
     names = ("nz", "nw", last)
-    for nx, small in product([given["nx"]] if "nx" in given else _first(base.nx), _SMALL):
-        attempt({"nx": nx, **{name: given.get(name, small[name]) for name in names}})
-    before = 1.0
-    while (best := leader()) and best.ratio < _GAIN * before and budget > 0.0:
-        before = best.ratio
-        for change in _larger(best.sizes, given, last):
-            attempt(change)
-    if leader() is None:
+    try:
+        for nx, small in product([given["nx"]] if "nx" in given else _first(base.nx), _SMALL):
+            attempt({"nx": nx, **{name: given.get(name, small[name]) for name in names}})
+        before = 1.0
+        while (best := leader()) and best.ratio < _GAIN * before and left > 0.0:
+            before = best.ratio
+            for change in _larger(best.sizes, given, last):
+                attempt(change)
+    except StoppedError:
+        if not tried:
+            raise
+        watch(f"note: stopped while sizes were chosen: the best of {len(begun) - 1} go on")
+    if not tried:
         raise InputError(
-            "all models that were tried diverge where they are not fitted; give training data at "
-            "amplitudes like these, or set the sizes."
+            "no NL-LFR of the sizes that were tried can be begun on these records; give longer "
+            "records, or set the sizes."
+        )
+    if refused := sum(c.remembers for c in tried):
+        watch(
+            f"note: {refused} of {len(tried)} candidates are left out: what they simulate depends "
+            "for ever on where it began, and the records show no such thing"
         )
     counts, base = study.counts, study.best_linear()
     tried = [replace(c, ratio=sqrt(c.squares.sum() / base.total)) for c in tried]
@@ -290,6 +312,14 @@ def choose_sizes(
     seconds = time.perf_counter() - clock
     left_out = study.whole(both)
     return Choice(tuple(tried), chosen, base.nx, counts, left_out, seconds)
+
+
+def _no_error(found: Sequence[Candidate]) -> str:
+    """Say why sizes have no error where they are left out."""
+    if not found:
+        return "too many parameters for these records"
+    remember = any(c.remembers for c in found)
+    return "does not forget where it began" if remember else "diverges"
 
 
 def _budget(rows: int) -> float:
@@ -320,7 +350,7 @@ def _chosen(
     squares = np.array([c.squares[list(of)].ravel() for c in tried])
     squares = ranks.first(torch.from_numpy(squares)).numpy()
     good = as_good(squares, counts[list(of)].ravel())
-    near = [c for c, enough in zip(tried, good, strict=True) if enough]
+    near = [c for c, enough in zip(tried, good, strict=True) if enough] or tried  # all diverge
     return min(near, key=lambda c: c.parameters_net)
 
 
@@ -335,7 +365,16 @@ class _Linear(NamedTuple):
     @property
     def total(self) -> float:
         """Sum of the squares, not 0."""
-        return max(float(self.squares.sum()), _TINY)
+        return float(self.squares.sum())
+
+
+class _Step(NamedTuple):
+    """A fit without a stretch at one ridge."""
+
+    cost: float  # in training; infinite if the model is refused
+    through: Array  # the output where it was left out, simulated through
+    fresh: Array  # and begun there
+    remembers: bool  # whether it is refused as it does not forget where it began
 
 
 class _Study:
@@ -373,8 +412,9 @@ class _Study:
                 models = self._alone(partial(_refined, model), self._folds)
             except ValueError:
                 return False
-            outputs = self._alone(self._simulated, list(zip(models, self._folds, strict=True)))
-            squares = self._squares(outputs)
+            both = self._alone(self._simulated, list(zip(models, self._folds, strict=True)))
+            outputs, fresh = ([each[i] for each in both] for i in range(2))
+            squares = self._squares(outputs, fresh)
             if np.isfinite(squares).all():
                 self._linear[nx] = _Linear(nx, models, outputs, squares)
         return self._linear[nx] is not None
@@ -393,41 +433,37 @@ class _Study:
         return found[int(np.argmax(good))]
 
     def candidates(self, sizes: Sizes, start: Start, seed: int, base: float) -> list[Candidate]:
-        """Return a candidate for each ridge; none if no fit can begin."""
+        """Return a candidate for each ridge, as long as they get better; none if no fit begins."""
         static = {name: size for name, size in sizes.items() if name != "nx"}
-        jobs = [(k, seed + 1000 * i) for k in range(FOLDS) for i in range(_STARTS)]
         linear = self._linear[sizes["nx"]]
         assert linear is not None
-
-        def path(job: tuple[int, int]) -> tuple[int, list[tuple[float, Array]]]:
-            k, own = job
-            fold = self._folds[k]
-            model = start(linear.models[k], fold.train, static, own)
+        paths, parameters = list[Iterator[_Step]](), 0
+        for k, own in product(range(FOLDS), (seed + 1000 * i for i in range(_STARTS))):
+            try:
+                model = start(linear.models[k], self._folds[k].train, static, own)
+            except InputError:
+                return []
             if not isinstance(model, Model):
                 raise LfrtorchError(
                     f"start returned {brief(repr(model))}; it is to return a Model."
                 )
             parameters = model.net_parameter_count
-            try:
-                return parameters, list(self._path(model, fold))
-            except InputError:  # it diverges on what it is fitted to
-                lost = np.full_like(linear.outputs[k], np.inf)
-                return parameters, [(np.inf, lost)] * len(self._ridges)
-
-        try:
-            paths = self._alone(path, jobs)
-        except InputError:
-            return []
-        found = []
-        for i, (ridge, _) in enumerate(self._ridges):
-            outputs = [
-                _mean([steps[i] for (fold, _), (_, steps) in zip(jobs, paths, strict=True)
-                       if fold == k])
-                for k in range(FOLDS)
-            ]  # fmt: skip
-            squares = self._squares(outputs)
+            if parameters > _DENSEST * self.rows:
+                return []
+            paths.append(self._path(model, linear, k))
+        found, worse = list[Candidate](), 0
+        for ridge, _ in self._ridges:
+            every = self._alone(next, paths)
+            steps = [every[k * _STARTS : (k + 1) * _STARTS] for k in range(FOLDS)]
+            outputs, fresh = zip(*map(_mean, steps), strict=True)
+            squares = self._squares(outputs, fresh)
+            remember = any(all(step.remembers for step in own) for own in steps)
             ratio = sqrt(squares.sum() / base)
-            found.append(Candidate(sizes, ridge, paths[0][0], ratio, squares, outputs))
+            best = min((c.ratio for c in found), default=np.inf)
+            found.append(Candidate(sizes, ridge, parameters, ratio, squares, outputs, remember))
+            worse = worse + 1 if ratio > _WORSE * best else 0
+            if worse == 2:
+                break
         return found
 
     def work(self, parameters: int) -> float:
@@ -450,21 +486,30 @@ class _Study:
             found.append((record, *signals))
         return found
 
-    def _path(self, model: Model, fold: Fold) -> Iterator[tuple[float, Array]]:
-        """Yield the cost in training and the output left out at each ridge."""
+    def _path(self, model: Model, linear: _Linear, k: int) -> Iterator[_Step]:
+        """Yield the cost in training and the outputs left out at each ridge."""
         # Nothing here looks at what is measured where it is left out.
-        problem = Problem.of(model, fold.train, guarantee=self._guarantee)
+        fold = self._folds[k]
+        try:
+            problem = Problem.of(model, fold.train, guarantee=self._guarantee)
+        except InputError:  # it diverges on what it is fitted to
+            lost = np.full_like(linear.outputs[k], np.inf)
+            yield from [_Step(np.inf, lost, lost, False)] * len(self._ridges)
+            return
         theta = problem.theta
         # Start states at one ridge are near those at the next.
-        judged = [
-            SimulationErrors(
-                model.lfr.cell,
-                [model.scaler.normalise(record)],
-                Ranks(),
-                solve_initial_states=True,
-            )
-            for record in self._records
-        ]
+        judges = dict[int, SimulationErrors]()
+
+        def simulated(record: Record) -> Array:
+            if id(record) not in judges:
+                own = [model.scaler.normalise(record)]
+                judges[id(record)] = SimulationErrors(
+                    model.lfr.cell, own, Ranks(), solve_initial_states=True
+                )
+            judge = judges[id(record)]
+            y = judge.trajectories(theta[: judge.parameters.own])[0].y[0]
+            return record.shown(model.scaler.restore_y(y.double().numpy()))
+
         for ridge, iterations in self._ridges:
             problem.weigh(ridge)
             search = LevenbergMarquardt(max_iter=iterations, tolerance=1e-3, patience=2)
@@ -476,31 +521,36 @@ class _Study:
             theta = state.theta
             problem.write(theta)
             stable = largest_stable_amplitude(model, fold.train) >= max(LOUDER)
-            found = []
-            for record, each in zip(self._records, judged, strict=True):
-                y = each.trajectories(theta[: each.parameters.own])[0].y[0]
-                found.append(record.shown(model.scaler.restore_y(y.double().numpy())))
-            yield state.cost if stable else np.inf, fold.left_out(found)
+            remembers = stable and not forgets(model, fold.train, linear.models[k]).right
+            through = [simulated(record) for record in self._records]
+            both = fold.left_out(through), fold.begun_again(through, simulated)
+            cost = state.cost if stable and not remembers else np.inf
+            yield _Step(cost, *both, remembers)
 
-    def _simulated(self, job: tuple[LinearModel, Fold]) -> Array:
-        """Return the simulated output where it was left out."""
+    def _simulated(self, job: tuple[LinearModel, Fold]) -> tuple[Array, Array]:
+        """Return the output where it was left out: simulated through, and begun there."""
         model, fold = job
         with np.errstate(over="ignore", invalid="ignore"):
-            return fold.left_out([model.simulate(record) for record in self._records])
+            through = [model.simulate(record) for record in self._records]
+            return fold.left_out(through), fold.begun_again(through, model.simulate)
 
     def _left_out(self, name: str) -> list[Array]:
         signals = [getattr(record, name) for record in self._records]
         return [fold.left_out(signals) for fold in self._folds]
 
-    def _squares(self, outputs: Sequence[Array]) -> Array:
+    def _squares(self, *outputs: Sequence[Array]) -> Array:
         """Return sums of the squared relative errors in blocks of each stretch, (folds, B)."""
-        pairs = zip(self._left_out("y"), self._left_out("scored"), outputs, strict=True)
+        signals = zip(self._left_out("y"), self._left_out("scored"), *outputs, strict=True)
         with np.errstate(over="ignore", invalid="ignore"):
             errors = [
-                np.mean(np.where(there, (y_hat - y) / self._scale, 0.0) ** 2, axis=1)
-                for y, there, y_hat in pairs
+                np.mean(
+                    np.where(there, (np.array(y_hats) - y) / self._scale, 0.0) ** 2, axis=(0, 2)
+                )
+                for y, there, *y_hats in signals
             ]
-        found = np.array([[b.sum() for b in np.array_split(e, _BLOCKS)] for e in errors])
+        found = np.array(
+            [[b.sum() + _FLOOR**2 * len(b) for b in np.array_split(e, _BLOCKS)] for e in errors]
+        )
         return found if np.isfinite(found).all() else np.full(found.shape, np.inf)
 
     def _alone(self, work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
@@ -515,8 +565,10 @@ def _refined(model: LinearModel, fold: Fold) -> LinearModel:
     return refined_near(model, fold.train)
 
 
-def _mean(steps: Sequence[tuple[float, Array]]) -> Array:
-    """Return the mean output of the starts whose cost, infinite if unstable, is near the least."""
-    least = min(cost for cost, _ in steps)
-    near = [output for cost, output in steps if cost <= _NEAR**2 * least < np.inf]
-    return np.mean(near, axis=0) if near else np.full_like(steps[0][1], np.inf)
+def _mean(steps: Sequence[_Step]) -> tuple[Array, Array]:
+    """Return the mean outputs of the starts whose cost, infinite if unstable, is near the least."""
+    least = min(step.cost for step in steps)
+    near = [(step.through, step.fresh) for step in steps if step.cost <= _NEAR**2 * least < np.inf]
+    lost = np.full_like(steps[0].through, np.inf)
+    outputs, fresh = (np.mean(each, axis=0) for each in zip(*(near or [(lost, lost)]), strict=True))
+    return outputs, fresh

@@ -10,7 +10,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ import numpy as np
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch.records import Record, as_records, without_coordinates
-from lfrtorch.score_window import SHORTEST, with_window
+from lfrtorch.score_window import SHORTEST, score_window, with_window
 
 
 class Fold(NamedTuple):
@@ -29,15 +29,28 @@ class Fold(NamedTuple):
     Args:
         train: the records, their measurements masked where they are left out.
         windows: first sample and the one after the last, of each record; equal if none is left out.
+        begun: what is left out of each as a record that begins there, in an estimated state; None
+            if that is too little to tell a state and score the rest.
     """
 
     train: list[Record]
     windows: list[tuple[int, int]]
+    begun: list[Record | None]
 
     def left_out(self, signals: Sequence[np.ndarray]) -> np.ndarray:
         """Return the samples that are left out of signals (T, n), a signal each record."""
         pairs = zip(signals, self.windows, strict=True)
         return np.concatenate([signal[a:b] for signal, (a, b) in pairs])
+
+    def begun_again(
+        self, signals: Sequence[np.ndarray], simulate: Callable[[Record], np.ndarray]
+    ) -> np.ndarray:
+        """Return ``left_out`` of signals, with simulations that begin there in their place."""
+        found = [np.array(signal) for signal in signals]
+        for signal, part, (a, b) in zip(found, self.begun, self.windows, strict=True):
+            if part is not None:  # whose skipped samples tell its start
+                signal[a + part.skip : b] = simulate(part)[part.skip :]
+        return self.left_out(found)
 
 
 def as_folded(records: Record | Sequence[Record]) -> list[Record]:
@@ -78,8 +91,19 @@ def folds(records: Sequence[Record], count: int) -> list[Fold]:
                 f"the records have {ends[-1]} scored samples, of which {count} stretches are left "
                 f"out in turn; each needs {SHORTEST}: give longer records."
             )
-        found.append(Fold(train, windows))
+        begun = [_begun(r, *window) for r, window in zip(records, windows, strict=True)]
+        found.append(Fold(train, windows, begun))
     return found
+
+
+def _begun(record: Record, first: int, last: int) -> Record | None:
+    """Return a stretch of a record as one with an estimated start; None if it is too short."""
+    skip = score_window(last - first) if last > first else 0
+    valid = np.ones_like(record.y, dtype=bool) if record.valid is None else record.valid
+    told = valid[first : first + skip].any(axis=0).all() and valid[first + skip : last].any()
+    if last - first - skip < SHORTEST or not told:
+        return None
+    return replace(record[first:last], start="estimated", skip=skip)
 
 
 def _masked(record: Record, first: int, last: int) -> Record | None:

@@ -21,6 +21,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from math import ceil
@@ -39,6 +40,7 @@ from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.exclusions import refuse_together
+from lfrtorch.fitting.forgetting import forgets
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.over_processes import OverProcesses, same_weights
@@ -280,6 +282,7 @@ def _fitted(
         else:
             together = Together(fits, watching, halt)
         judge = _Judge(fits, unseen if selection or average > 1 else [], together)
+        begun = deepcopy(starts[0])
         for number, (_, until) in enumerate(planned, start=1):
             if number <= len(snapshots.rounds):
                 field = _drop_others(field, [fits[i] for i in snapshots.rounds[number - 1]])
@@ -300,6 +303,8 @@ def _fitted(
                 kept, _ = planned[number]
                 snapshots.decided([judge.numbers[id(fit)] for fit in field[:kept]])
                 field = _drop_others(field, field[:kept])
+    if len(fits) > 1 and options["horizon"] is None and not begun.lfr.cell.past_outputs:
+        judge.refuse_what_remembers(field, train, begun)
     ranked = judge.ranked(fits)
     result = ranked[0].result()
     if cut is not None:  # the best start may have come to its end, but not all of those beside it
@@ -383,10 +388,21 @@ class _Judge:
         self._fits, self._records, self._together = fits, records, together
         self.numbers = {id(fit): number for number, fit in enumerate(fits)}
         self._errors = {id(fit): self._error(fit.model) for fit in fits} if records else {}
+        self._refused = set[int]()
 
     def ranked(self, fits: Sequence[Fit]) -> list[Fit]:
-        """Sort the fits that have begun, the best first."""
-        return sorted((fit for fit in fits if fit.history), key=self._score)
+        """Sort the fits that have begun, the best first, and those that are refused last."""
+        begun = (fit for fit in fits if fit.history)
+        return sorted(begun, key=lambda fit: (id(fit) in self._refused, self._score(fit)))
+
+    def refuse_what_remembers(
+        self, fits: Sequence[Fit], train: Sequence[Record], start: Model
+    ) -> None:
+        """Let models that do not forget where they began lose to all that do."""
+        remember = [not forgets(fit.model, train, start).right for fit in fits]
+        for fit, refused in zip(fits, self._same([*map(float, remember)]), strict=True):
+            if refused:
+                self._refused.add(id(fit))
 
     def summaries(self, fits: Sequence[Fit]) -> tuple[RestartSummary, ...]:
         """Say how far each came."""
@@ -404,7 +420,7 @@ class _Judge:
         """Return the models that stay stable on louder inputs, the best first."""
         # With one that does not, a mean runs away. Rounding may differ between processes, and the
         # choice must not.
-        models = [fit.model for fit in self.ranked(fits)]
+        models = [fit.model for fit in self.ranked(fits) if id(fit) not in self._refused]
         reach = self._same([largest_stable_amplitude(model, train) for model in models])
         return [model for model, to in zip(models, reach, strict=True) if to >= max(LOUDER)]
 

@@ -157,7 +157,7 @@ def test_what_is_not_to_be_used_is_named(change: dict[str, Any], said: str):
         procedure.choose_sizes(record, [2], **given)
 
 
-def test_a_stop_ends_the_choice():
+def test_a_stop_before_the_first_sizes_ends_the_choice():
     with pytest.raises(StoppedError, match="while sizes were chosen"):
         chosen(measured(1.0), stop=lambda: True)
 
@@ -169,14 +169,6 @@ def test_table_has_a_line_for_each_size_and_marks_the_chosen(saturating: Choice)
     assert len(lines) == len(sizes) + 2 + len(procedure.LEGEND.splitlines())
     entries = saturating.entries()
     assert sum(entry["chosen"] for entry in entries) == 1
-
-
-def test_a_mean_leaves_out_what_runs_away():
-    low, high = np.zeros((3, 1)), np.full((3, 1), 100.0)
-    assert procedure._mean([(1.0, low), (np.inf, high)]).max() == 0.0
-    assert procedure._mean([(1.0, low), (1.3, high)]).max() == 50.0
-    assert procedure._mean([(1.0, low), (2.0, high)]).max() == 0.0
-    assert np.isinf(procedure._mean([(np.inf, low)])).all()
 
 
 def test_all_processes_take_the_choice_of_the_first(saturating: Choice):
