@@ -61,6 +61,7 @@ from lfrtorch.reporting.evaluation import (
     cross_validated,
     worst_residuals,
 )
+from lfrtorch.reporting.opponent import Opponents, opponents
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import metrics
 from lfrtorch.reporting.verdict import judge, reconsidered
@@ -247,7 +248,7 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     if settings.refit:
         result, again = refitted(replace(given, settings=settings), result)
     return scored_run(
-        dataset, settings, linear, result, order_scan=order_scan, choice=choice, again=again
+        stage, settings, linear, result, order_scan=order_scan, choice=choice, again=again
     )
 
 
@@ -309,7 +310,7 @@ def _most_averaged(models: Sequence[Model], average: int, observer: Observer) ->
 
 
 def scored_run(
-    dataset: Dataset,
+    stage: Stage,
     settings: Settings,
     linear: LinearModel,
     result: FitResult,
@@ -319,6 +320,10 @@ def scored_run(
     again: FitResult | None = None,
 ) -> Run:
     """Score all records, the tests by the model fitted again; add verdict and advice."""
+    dataset = stage.dataset
+    in_turn = choice is not None and not dataset.tests  # what was left out judges
+    scan = None if in_turn else order_scan
+    opposed = linear_opponents(dataset, settings, linear, scan, stage.observer)
     samples = sum(record.samples for record in dataset.train)
     fitted_to = f"{dataset.name}: {len(dataset.train)} record(s), {samples} samples"
     model = replace(result.model, fitted_to=fitted_to).reaching(dataset.train)
@@ -329,7 +334,8 @@ def scored_run(
         again = replace(again, model=replace(again.model, fitted_to=fitted_to).reaching(known))
     evaluation = Evaluation(
         dataset=dataset,
-        linear=linear,
+        linear=opposed[None],
+        predictors=opposed,
         model=result.model,
         refitted=None if again is None else again.model,
         own=linear_models_of_tests(dataset, settings),
@@ -338,18 +344,20 @@ def scored_run(
     )
     judged = simulations = evaluation.simulations
     ahead = settings.horizon if begins_at_outputs(dataset.train) else None
-    if settings.noise == "output" or (choice is not None and not dataset.tests):
+    opponent = opposed[None]
+    if settings.noise == "output" or in_turn:
         error = "error" if ahead is None else f"error {ahead} samples ahead"
-        verdict = judge(result, simulations, linear_nx=linear.nx, error=error)
+        verdict = judge(result, simulations, linear_nx=opponent.nx, error=error)
     else:
+        opponent = opposed[HORIZONS[0]]
         one, some, _ = HORIZONS
         judged = evaluation.predictions[one]
         views = {
             f"error {some} ahead": evaluation.predictions[some],
             "simulation error": simulations,
         }
-        verdict = judge(result, judged, linear_nx=linear.nx, error="prediction error")
-        verdict = reconsidered(verdict, result, views, linear_nx=linear.nx)
+        verdict = judge(result, judged, linear_nx=opponent.nx, error="prediction error")
+        verdict = reconsidered(verdict, result, views, linear_nx=opponent.nx)
     residuals = worst_residuals(judged)
     found = evidence(
         result,
@@ -382,7 +390,7 @@ def scored_run(
     return Run(
         dataset=dataset,
         settings=settings,
-        linear=linear,
+        linear=opponent,
         order_scan=order_scan,
         choice=choice,
         fit=result,
@@ -394,6 +402,27 @@ def scored_run(
         verdict=verdict,
         advice=advise(found),
     )
+
+
+def linear_opponents(
+    dataset: Dataset,
+    settings: Settings,
+    linear: LinearModel,
+    scan: OrderScan | None,
+    observer: Observer,
+) -> Opponents:
+    """The linear models that the NL-LFR is compared with, of the order that a scan chose."""
+    ahead = () if settings.noise == "output" else HORIZONS
+    if begins_at_outputs(dataset.train):
+        return dict.fromkeys((None, *ahead), linear)
+    nx = linear.nx if scan is None else scan.chosen
+    records = linear_records(dataset.train, replace(of_linear_model(settings), nx=nx), Observer())
+    found = opponents(linear, records, dataset, nx=nx, options=settings.linear, ahead=ahead)
+    others = {id(model): model for model in found.values() if model is not linear}
+    for model in others.values():
+        observer.say("another linear model does better than the start; it is the one compared with")
+        tell(model, observer)
+    return found
 
 
 def of_linear_model(settings: Settings) -> Settings:
@@ -546,10 +575,13 @@ def starting_model(
 
 def linear_models_of_tests(dataset: Dataset, settings: Settings) -> dict[str, LinearModel]:
     """Linear models of single tests, if ``dataset.linear`` asks for them, by the test's name."""
+    options = {**settings.linear}
+    if settings.noise == "output" and options.get("refine") == "prediction":
+        options["refine"] = None  # simulations are judged
     records = {record.name: record for record in dataset.train}
     # Tests that share their records share the model.
     of = list(dict.fromkeys(dataset.linear.values()))
-    estimate = partial(estimate_bla, nx=cast(int, of_linear_model(settings).nx), **settings.linear)
+    estimate = partial(estimate_bla, nx=cast(int, of_linear_model(settings).nx), **options)
     models = each_alone(estimate, [[records[name] for name in names] for names in of])
     by_records = dict(zip(of, models, strict=True))
     return {test: by_records[names] for test, names in dataset.linear.items()}

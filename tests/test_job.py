@@ -92,7 +92,7 @@ def test_chosen_sizes_are_fitted_to_all_estimation_records(dataset: Dataset):
     chosen = run.choice.chosen
     assert run.settings.sizes == chosen.sizes
     assert run.settings.ridge == chosen.ridge
-    assert run.linear.nx == run.choice.nx
+    assert run.linear.nx == run.order_scan.chosen
     assert f"the linear model (nx {run.linear.nx}): " in run.verdict.text
     samples = sum(r.samples for r in (*dataset.train, *dataset.validation))
     assert run.metrics["data"]["samples"] == samples

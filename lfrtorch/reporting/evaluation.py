@@ -18,6 +18,7 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import nrmse, rmse, rmse_by_output
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, without_coordinates
+from lfrtorch.reporting.opponent import Opponents, output
 from lfrtorch.score_window import fitted
 
 _LINEAR, _NL_LFR = "linear", "NL-LFR"  # names of the two models
@@ -149,6 +150,7 @@ class Evaluation:
 
     dataset: Dataset
     linear: LinearModel | None = None  # of all training records
+    predictors: Opponents = field(default_factory=dict)  # other ones by the horizon
     model: Model | None = None
     refitted: Model | None = None  # to all estimation records: it simulates the tests
     own: Mapping[str, LinearModel] = field(default_factory=dict)  # of single tests, by name
@@ -203,15 +205,13 @@ class Evaluation:
             return {}
         found: dict[int, list[Response]] = {horizon: [] for horizon in HORIZONS}
         for use, record in self._records:
-            linear, model = self._models(use, record)
+            own, model = self._models(use, record)
+            assert model is not None
             driven = without_coordinates(fitted(record) if use == "train" else record)
-            named = {_LINEAR: None if linear is None else linear.to_model(), _NL_LFR: model}
             for horizon, responses in found.items():
-                predicted = {
-                    name: each.predict(driven, horizon=horizon)
-                    for name, each in named.items()
-                    if each is not None and each.K is not None
-                }
+                linear = self.predictors.get(horizon, own) if own is self.linear else own
+                predicted = {} if linear is None else {_LINEAR: output(linear, driven, horizon)}
+                predicted[_NL_LFR] = model.predict(driven, horizon=horizon)
                 responses.append(Response(record, use, predicted))
         return found
 
