@@ -64,7 +64,7 @@ from lfrtorch.reporting.evaluation import (
 from lfrtorch.reporting.opponent import Opponents, opponents
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import metrics
-from lfrtorch.reporting.verdict import judge, reconsidered
+from lfrtorch.reporting.verdict import judge, judge_predictions
 
 _CUT = 0.2, 0.2
 """Parts of a record for validation and test."""
@@ -350,14 +350,8 @@ def scored_run(
         verdict = judge(result, simulations, linear_nx=opponent.nx, error=error)
     else:
         opponent = opposed[HORIZONS[0]]
-        one, some, _ = HORIZONS
-        judged = evaluation.predictions[one]
-        views = {
-            f"error {some} ahead": evaluation.predictions[some],
-            "simulation error": simulations,
-        }
-        verdict = judge(result, judged, linear_nx=opponent.nx, error="prediction error")
-        verdict = reconsidered(verdict, result, views, linear_nx=opponent.nx)
+        judged = evaluation.predictions[HORIZONS[0]]
+        verdict = judge_predictions(result, evaluation.predictions, linear_nx=opponent.nx)
     residuals = worst_residuals(judged)
     found = evidence(
         result,

@@ -27,6 +27,8 @@ _HOLD = "hold"  # the name of no model: what was measured stays
 CROSS = "cross-validation"
 """Name of what stands for a validation record if all records are fitted."""
 
+_STILL = 0.1  # deviation of a signal over that in training, up to which it stands still
+
 HORIZONS = 1, 10, 100
 """Samples ahead that predictions are scored at."""
 
@@ -253,6 +255,23 @@ def cross_validated(
         simulated = {_LINEAR: linear, _NL_LFR: y_hat}
         found.append(Response(replace(record, name=name), "validation", simulated))
     return found
+
+
+def training_deviations(responses: Sequence[Response]) -> tuple[Array, Array]:
+    """Standard deviations of inputs (nu,) and outputs (ny,) in training, or without it in all."""
+    train = [r for r in responses if r.use == "train"] or responses
+    u, y = (np.concatenate(signal) for signal in zip(*map(_signals, train), strict=True))
+    return u.std(axis=0), y.std(axis=0)
+
+
+def has_settled(response: Response, deviations: tuple[Array, Array]) -> bool:
+    """Whether inputs and outputs stand still, against their deviations in training."""
+    signals = zip(_signals(response), deviations, strict=True)
+    return all((signal.std(axis=0) <= _STILL * usual).all() for signal, usual in signals)
+
+
+def _signals(response: Response) -> tuple[Array, Array]:
+    return response.record.u[response.record.skip :], response.scored
 
 
 def ranked(responses: Sequence[Response]) -> list[Response]:

@@ -33,7 +33,7 @@ from lfrtorch.fitting.choice import LEGEND, choice_table
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.records import common_unit
-from lfrtorch.reporting.evaluation import Evaluation
+from lfrtorch.reporting.evaluation import Evaluation, training_deviations
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.score_columns import (
     ALL,
@@ -118,11 +118,14 @@ def comparisons(evaluation: Evaluation) -> list[str]:
     """How far the NL-LFR came, beside the linear model: a line for each output of a few tests."""
     # Without tests the lines are on the validation records, or else on the training records.
     responses = evaluation.simulations
+    _, usual = training_deviations(responses)
     uses = ("test", "validation", "train")
     use = next(use for use in uses if any(response.use == use for response in responses))
     shown = []
     for response in (response for response in responses if response.use == use):
         rows = [r for r in rows_of(response.record.name, response.score) if r.output != ALL]
+        # As the verdict has it: a record in which little happens is no measure.
+        rows = [r._replace(std=np.fmax(r.std, own)) for r, own in zip(rows, usual, strict=True)]
         shown += [(r.record + f", {r.output}" * (len(rows) > 1), r) for r in rows]
     scored = sorted((item for item in shown if item[1].ratio > 0), key=lambda item: item[1].ratio)
     if len(shown) <= _FEW or not scored:
@@ -131,7 +134,7 @@ def comparisons(evaluation: Evaluation) -> list[str]:
     relative = sorted(row.relative(row.error) or 0.0 for _, row in scored)
     line = (
         f"{len(scored)} {use} errors: {least} to {most} of the linear model's, "
-        f"NRMSE {percent(relative[0])} to {percent(relative[-1])}"
+        f"{percent(relative[0])} to {percent(relative[-1])} of the output's deviation"
     )
     return [line, *(_line(*item) for item in shown if item not in scored)]
 
@@ -142,7 +145,9 @@ def _line(name: str, row: Row) -> str:
     error, linear = quantities([row.error, row.linear], row.unit)
     beside = of_linear(row.error / row.linear) if row.linear else "not comparable"
     relative = percent(row.relative(row.error))
-    return f"{name}: error {beside} ({error} against {linear}), NRMSE {relative}"
+    return (
+        f"{name}: error {beside} ({error} against {linear}), {relative} of the output's deviation"
+    )
 
 
 def _scores(metrics: Mapping[str, Any], evaluation: Evaluation) -> dict[str, Any]:

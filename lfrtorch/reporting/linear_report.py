@@ -54,7 +54,7 @@ def numbers(evaluation: Evaluation, frf: FRF | None, scan: OrderScan | None) -> 
             "seconds": fit.seconds,
         },
         "scores": scores,
-        "verdict": judge_linear(scores),
+        "verdict": judge_linear(evaluation.simulations),
         "poles": frequency_and_damping(model.poles, model.fs),
         "zeros": {
             name: frequency_and_damping(z, model.fs)

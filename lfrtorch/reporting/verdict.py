@@ -9,6 +9,9 @@ none. What was left out in turn is the whole record, each stretch judged by mode
 without it: there 2.25 standard errors and 1 % are enough (``benchmarks/first_try.md``). There one
 stretch in which the choice without it is poor may have most of the error; so it is enough, too, if
 the mean of the blocks' own log ratios is clear by 3 standard errors, and the whole ratio below 1.
+
+A part in which inputs and outputs stand still, as the end of a step test, tells the gain alone. It
+can show that a model is worse, and not that it is better: that is said of the parts that move.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ from lfrtorch._support.types import Array, Integers
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.metrics import nrmse, rms
 from lfrtorch.paired_blocks import BLOCKS, blocked_mean, in_blocks
-from lfrtorch.reporting.evaluation import CROSS, Response
+from lfrtorch.reporting.evaluation import CROSS, Response, has_settled, training_deviations
 
 NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"
 """What a verdict says is to be used."""
@@ -46,7 +49,9 @@ CONFIDENCE = 0.975
 the records that are compared one by one."""
 
 EXPLAINS_NOTHING = 0.9
-"""Error over the output's standard deviation from which on a model is of no use."""
+"""Error over the output's standard deviation from which on a model is of no use. The deviation is
+that of the record, or of the training records if it is larger: a record may have settled."""
+
 
 _LONGEST_NAME = 28  # characters of a record's name in a sentence
 
@@ -63,7 +68,7 @@ class Kind(StrEnum):
     DIVERGES = "diverges"
     """Its simulation runs away on a record, or the search failed."""
     UNJUDGED = "unjudged"
-    """Nothing was held out: only the training error is known."""
+    """Nothing was held out that moves: the training error is known, or the gain."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,13 @@ class Verdict:
 
     def __str__(self) -> str:
         return self.text
+
+
+class Refusal(NamedTuple):
+    """A reason not to call an NL-LFR better whose error is smaller."""
+
+    text: str  # in a sentence after "the error is 67 % of its, but", in 42 characters at most
+    kind: Kind = Kind.WORSE  # what the verdict comes to
 
 
 class _Compared(NamedTuple):
@@ -122,108 +134,228 @@ class _Errors(NamedTuple):
     linear: Array
     counts: Integers
     power: float
+    settled: bool  # whether it tells the gain alone
+
+
+class _Case(NamedTuple):
+    """What the rules of a verdict look at."""
+
+    result: FitResult
+    lost: Sequence[Response]  # on which the NL-LFR diverges
+    whole: _Compared | None  # on all records that judge
+    worst: _Compared | None  # on the record where it is clearly worse
+    held_out: bool  # whether the records that judge were not fitted
+    settled: str  # tests that have settled, in words, if others judge or none does
+    moves: bool  # whether the records that judge do
+    nx: int  # of the linear model
+    error: str  # what is compared
+    refusals: Sequence[Refusal]
+
+    @property
+    def linear(self) -> str:
+        """The linear model in words."""
+        return f"the linear model (nx {self.nx})"
+
+
+_Found = tuple[Kind, str, str]  # what a verdict comes to, what is to be used, and the sentence
 
 
 def judge(
-    result: FitResult, responses: Sequence[Response], *, linear_nx: int, error: str = "error"
+    result: FitResult,
+    responses: Sequence[Response],
+    *,
+    linear_nx: int,
+    error: str = "error",
+    refusals: Sequence[Refusal] = (),
 ) -> Verdict:
     """Judge a fit by the errors on all records.
 
     Every record that was not fitted is looked at: one on which the NL-LFR is clearly worse is
-    enough. It is better if it is so on the tests together, or without tests on validation.
-    Records of fewer than ten scored samples say nothing.
+    enough. It is better if it is so on the tests together, without tests that move on validation,
+    and if nothing refuses that. Records of fewer than ten scored samples say nothing.
 
     """
     lost = [r for r in responses if not np.isfinite(rms(r.error))]
-    failed = result.reason in (Reason.GRADIENT_DIVERGED, Reason.JACOBIAN_VANISHES)
-    errors = _errors([r for r in responses if r not in lost])
+    errors = _errors([r for r in responses if r not in lost], responses)
     held_out = [e for e in errors if e.response.use != "train"]
-    judged = [e for e in held_out if e.response.use == "test"] or held_out or errors
+    tests = [e for e in held_out if e.response.use == "test"]
+    moving = [e for e in held_out if not e.settled]
+    judged = [e for e in moving if e.response.use == "test"] or moving or tests or held_out
+    still = [e.response for e in tests or held_out if e.settled]
     every = [_compared([e], len(held_out)) for e in held_out]
-    whole = _compared(judged) if judged else None
+    whole = _compared(judged or errors) if errors else None
     evidence = {} if whole is None else _numbers(whole)
     evidence |= {"records": [_numbers(c) for c in every], "diverges": [_name(r) for r in lost]}
-    worst = max((c for c in every if c.worse), key=lambda c: c.ratio, default=None)
-    linear = f"the linear model (nx {linear_nx})"
-
-    if lost or (failed and result.chosen_iteration == 0):
-        what = f"diverges on {_names(lost)}" if lost else f"was not trained: {result.reason}"
-        kind, use, text = Kind.DIVERGES, LINEAR_MODEL, f"The NL-LFR {what}"
-        if lost and all(nrmse(r.record, r.y_linear) >= EXPLAINS_NOTHING for r in lost):
-            text += f", where {linear} explains nothing, either"
-            return Verdict(kind, f"{text}: neither is usable.", NEITHER, evidence)
-    elif worst is not None:
-        kind, use = Kind.WORSE, LINEAR_MODEL
-        text = (
-            f"Worse than {linear}: on {worst.name} the NL-LFR's {error} is "
-            f"{number(worst.ratio)} times as large"
-        )
-    elif whole is None:
-        kind, use, text = Kind.UNJUDGED, NL_LFR, f"Not judged: no record has {BLOCKS} samples"
-    elif not held_out:
-        kind, use = Kind.UNJUDGED, NL_LFR if whole.ratio < 1.0 - SAME else LINEAR_MODEL
-        text = (
-            f"Not judged (nothing held out): on {whole.name} the {error} is "
-            f"{of_linear(whole.ratio)} (nx {linear_nx})"
-        )
-    elif whole.better:
-        kind, use = Kind.BETTER, NL_LFR
-        text = (
-            f"Better than {linear}: on {whole.name} the NL-LFR's {error} is "
-            f"{of_linear(whole.ratio)}"
-        )
-    # Difference that three digits do not show, its standard error included.
-    elif abs(whole.ratio - 1.0) + whole.ratio_std < 5e-4:
-        kind, use = Kind.LINEAR, LINEAR_MODEL
-        kept = "the fit kept its start, and " * (result.chosen_iteration == 0)
-        text = f"As {linear}: {kept}on {whole.name} the errors are the same"
-    else:
-        kind, use = Kind.LINEAR, LINEAR_MODEL
-        clearly = "clearly " * (whole.ratio < 1.0 - whole.same)
-        text = (
-            f"Not {clearly}better than {linear}: on {whole.name} the {error} is "
-            f"{number(100 * whole.ratio)} ± {number(100 * whole.ratio_std, 2)} % of its"
-        )
-    if whole is not None and held_out:
+    case = _Case(
+        result=result,
+        lost=lost,
+        whole=whole,
+        worst=max((c for c in every if c.worse), key=lambda c: c.ratio, default=None),
+        held_out=bool(held_out),
+        settled=_names(still) if still and not any(e in tests for e in moving) else "",
+        moves=bool(moving),
+        nx=linear_nx,
+        error=error,
+        refusals=refusals,
+    )
+    kind, use, text = next(found for rule in _RULES if (found := rule(case)) is not None)
+    if whole is not None and held_out and use != NEITHER:
         used = whole.nrmse if use == NL_LFR else whole.linear_nrmse
         if used >= EXPLAINS_NOTHING:
+            use = NEITHER
             text = (
-                f"Neither model is usable: on {whole.name} the output's errors are "
-                f"{percent(whole.nrmse)} (NL-LFR) and {percent(whole.linear_nrmse)} (linear, nx "
-                f"{linear_nx}) of its deviation"
+                f"Neither model is usable: on {whole.name} the errors are {percent(whole.nrmse)} "
+                f"(NL-LFR) and {percent(whole.linear_nrmse)} (linear, nx {linear_nx}) of the "
+                "output's deviation"
             )
-            return Verdict(kind, f"{text}.", NEITHER, evidence)
     advice = "; use the linear model" if use == LINEAR_MODEL else ""
     return Verdict(kind, f"{text}{advice}.", use, evidence)
 
 
-def reconsidered(
-    verdict: Verdict,
+def _diverges(case: _Case) -> _Found | None:
+    result, lost = case.result, case.lost
+    failed = result.reason in (Reason.GRADIENT_DIVERGED, Reason.JACOBIAN_VANISHES)
+    if not lost and not (failed and result.chosen_iteration == 0):
+        return None
+    what = f"diverges on {_names(lost)}" if lost else f"was not trained: {result.reason}"
+    if lost and all(nrmse(r.record, r.y_linear) >= EXPLAINS_NOTHING for r in lost):
+        text = f"The NL-LFR {what}, where {case.linear} explains nothing, either"
+        return Kind.DIVERGES, NEITHER, f"{text}: neither is usable"
+    return Kind.DIVERGES, LINEAR_MODEL, f"The NL-LFR {what}"
+
+
+def _worse(case: _Case) -> _Found | None:
+    if case.worst is None:
+        return None
+    text = (
+        f"Worse than {case.linear}: on {case.worst.name} the NL-LFR's {case.error} is "
+        f"{number(case.worst.ratio)} times as large"
+    )
+    return Kind.WORSE, LINEAR_MODEL, text
+
+
+def _training_alone(case: _Case) -> _Found | None:
+    if case.whole is None:
+        return Kind.UNJUDGED, NL_LFR, f"Not judged: no record has {BLOCKS} samples"
+    if case.held_out:
+        return None
+    text = (
+        f"Not judged (nothing held out): on {case.whole.name} the {case.error} is "
+        f"{of_linear(case.whole.ratio)} (nx {case.nx})"
+    )
+    return Kind.UNJUDGED, NL_LFR if case.whole.ratio < 1.0 - SAME else LINEAR_MODEL, text
+
+
+def _gain_alone(case: _Case) -> _Found | None:
+    if case.moves:
+        return None
+    text = f"Not decided beside {case.linear}: {case.settled} settled and tells the gain alone"
+    return Kind.UNJUDGED, LINEAR_MODEL, text
+
+
+def _better(case: _Case) -> _Found | None:
+    whole = case.whole
+    if whole is None or not whole.better:
+        return None
+    for refusal in case.refusals:
+        text = (
+            f"Not better than {case.linear}: the {case.error} is {percent(whole.ratio)} of its, "
+            f"but {refusal.text}"
+        )
+        return refusal.kind, LINEAR_MODEL, text
+    still = f" ({case.settled} settled)" if case.settled else ""
+    constant = ", itself worse than a constant" if whole.linear_nrmse > 1.0 else ""
+    text = f"Better than {case.linear}{constant}: on {whole.name} the NL-LFR's {case.error} is " + (
+        f"{percent(whole.ratio)} of its" if constant or still else of_linear(whole.ratio)
+    )
+    return Kind.BETTER, NL_LFR, text + still
+
+
+def _alike(case: _Case) -> _Found | None:
+    whole = case.whole
+    # Difference that three digits do not show, its standard error included.
+    if whole is None or abs(whole.ratio - 1.0) + whole.ratio_std >= 5e-4:
+        return None
+    kept = "the fit kept its start, and " * (case.result.chosen_iteration == 0)
+    text = f"As {case.linear}: {kept}on {whole.name} the errors are the same"
+    return Kind.LINEAR, LINEAR_MODEL, text
+
+
+def _not_better(case: _Case) -> _Found | None:
+    whole = case.whole
+    if whole is None:
+        return None
+    clearly = "clearly " * (whole.ratio < 1.0 - whole.same)
+    text = (
+        f"Not {clearly}better than {case.linear}: on {whole.name} the {case.error} is "
+        f"{number(100 * whole.ratio)} ± {number(100 * whole.ratio_std, 2)} % of its"
+    )
+    return Kind.LINEAR, LINEAR_MODEL, text
+
+
+_RULES = (_diverges, _worse, _training_alone, _gain_alone, _better, _alike, _not_better)
+"""The first that speaks makes the verdict."""
+
+
+def judge_predictions(
     result: FitResult,
-    views: Mapping[str, Sequence[Response]],
+    views: Mapping[int, Sequence[Response]],
     *,
     linear_nx: int,
+    refusals: Sequence[Refusal] = (),
 ) -> Verdict:
-    """The verdict on predictions one sample ahead, in view of others and of simulations."""
-    # Sensor noise may be all that both models leave one sample ahead. If they do alike there, the
-    # NL-LFR is better where it is so in one of the views, named by their errors, and worse in none.
-    if verdict.kind != Kind.LINEAR or verdict.use == NEITHER:
-        return verdict
-    others = [
-        judge(result, responses, linear_nx=linear_nx, error=error)
-        for error, responses in views.items()
-    ]
-    better = [other for other in others if other.kind == Kind.BETTER and other.use == NL_LFR]
-    if not better or any(other.kind in (Kind.WORSE, Kind.DIVERGES) for other in others):
-        return verdict
-    text = f"{better[0].text[:-1]}, {percent(verdict.evidence['ratio'])} one ahead."
-    evidence = {**better[0].evidence, "one_ahead": verdict.evidence}
-    return replace(better[0], text=text, evidence=evidence)
+    """Judge a fit by predictions so many samples ahead, the fewest first.
+
+    A small error one sample ahead is no merit of a model that is worse farther ahead. Sensor noise
+    may be all that both models leave there: then it is better if it is so farther ahead.
+
+    """
+    farther = {
+        ahead: judge(result, responses, linear_nx=linear_nx, error=f"error {ahead} ahead")
+        for ahead, responses in [*views.items()][1:]
+    }
+    refusals = [*refusals, *(r for at in farther.items() if (r := _farther(*at)) is not None)]
+    first = judge(
+        result,
+        next(iter(views.values())),
+        linear_nx=linear_nx,
+        error="prediction error",
+        refusals=refusals,
+    )
+    seen = {"ahead": {str(ahead): other.evidence for ahead, other in farther.items()}}
+    found = replace(first, evidence={**first.evidence, **seen})
+    if first.use == NEITHER or first.kind not in (Kind.BETTER, Kind.LINEAR) or refusals:
+        return found
+    better = [each for each in farther.values() if each.kind == Kind.BETTER and each.use == NL_LFR]
+    if first.kind == Kind.BETTER:
+        ratios = [e.evidence["ratio"] for e in (first, *farther.values()) if "ratio" in e.evidence]
+        listed = " and ".join(", ".join(f"{number(100 * r)}" for r in ratios).rsplit(", ", 1))
+        which = " and ".join(", ".join(map(str, views)).rsplit(", ", 1))
+        text = (
+            f"Better than the linear model (nx {linear_nx}): on {first.evidence['on']} the "
+            f"errors {which} samples ahead are {listed} % of its."
+        )
+        return replace(found, text=text)
+    if not better:
+        return found
+    text = f"{better[0].text[:-1]}, {percent(first.evidence['ratio'])} one ahead."
+    return replace(better[0], text=text, evidence=found.evidence)
 
 
-def judge_linear(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _farther(ahead: int, verdict: Verdict) -> Refusal | None:
+    """What a verdict farther ahead refuses; nothing where neither model foresees anything."""
+    ratio = verdict.evidence.get("ratio", math.inf)
+    worse = verdict.kind == Kind.WORSE and (verdict.use != NEITHER or ratio >= _CLEAR)
+    if verdict.kind == Kind.DIVERGES:
+        return Refusal(f"it diverges {ahead} samples ahead", Kind.DIVERGES)
+    return Refusal(f"{number(ratio)} times as large {ahead} samples ahead") if worse else None
+
+
+def judge_linear(responses: Sequence[Response]) -> dict[str, Any]:
     """Judge a linear model by its worst output on the tests, else validation, else training."""
-    errors = {use: _relative_errors(scores, use) for use in ("test", "validation", "train")}
+    uses = "test", "validation", "train"
+    parts = {use: [r for r in responses if r.use == use] for use in uses}
+    errors = {use: _relative_errors(part, responses) for use, part in parts.items()}
     judged = next((use for use, found in errors.items() if found), None)
     if judged is None:
         return {"usable": None, "text": "Not judged: nothing is scored."}
@@ -236,8 +368,13 @@ def judge_linear(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     where = "training" if judged == "train" else judged
     text = f"{'' if usable else 'Not usable: '}on {where} the linear model's error is {size}"
     fitted_error = errors["train"].get(name)
+    if error > 1.0:
+        text += ", worse than a constant"
     if not usable and judged != "train" and fitted_error is not None:
         text += f" (in training {percent(fitted_error)})"
+    deviations = training_deviations(responses)
+    if usable and judged != "train" and all(has_settled(r, deviations) for r in parts[judged]):
+        text += f"; {where} has settled and tells the gain alone"
     return {
         "usable": usable,
         "text": f"{text[0].upper()}{text[1:]}.",
@@ -247,15 +384,17 @@ def judge_linear(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _relative_errors(scores: Sequence[Mapping[str, Any]], use: str) -> dict[str, float]:
-    """Of each output that moves the error over the standard deviation, all records of a use."""
+def _relative_errors(part: Sequence[Response], every: Sequence[Response]) -> dict[str, float]:
+    """Each output's error over its standard deviation, all records of a part together."""
+    _, common = training_deviations(every)
     powers: dict[str, Array] = {}
-    for s in scores:
-        for o in s["outputs"]:
-            if s["use"] == use and s["scored"] and o["std"] > 0:
-                error = o["rmse"] if math.isfinite(o["rmse"]) else math.inf
-                own = s["scored"] * np.square([error, o["std"]])
-                powers[o["output"]] = powers.get(o["output"], np.zeros(2)) + own
+    for s in (response.score for response in part):
+        own = zip(s.channels, s.lti_rmse_by_output, np.fmax(s.std_by_output, common), strict=True)
+        for channel, error, deviation in own:
+            if s.scored and deviation > 0:
+                bounded = error if math.isfinite(error) else math.inf
+                power = s.scored * np.square([bounded, deviation])
+                powers[channel.name] = powers.get(channel.name, np.zeros(2)) + power
     return {name: float(np.sqrt(error / own)) for name, (error, own) in powers.items()}
 
 
@@ -266,15 +405,12 @@ def of_linear(ratio: float) -> str:
     return f"{number(ratio)} times the linear model's"
 
 
-def _errors(responses: Sequence[Response]) -> list[_Errors]:
+def _errors(responses: Sequence[Response], every: Sequence[Response]) -> list[_Errors]:
     """The squared errors of the records that are long enough, each output over its deviation."""
-    train = [r.scored for r in responses if r.use == "train"]
-    if not train:
-        train = [r.scored for r in responses]
-    if not train:
+    if not every:
         return []
-    scale = np.concatenate(train).std(axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
+    u, y = training_deviations(every)
+    scale = np.where(y > 0, y, 1.0)
     found = []
     for response in responses:
         if len(response.scored) < BLOCKS or not np.isfinite(rms(response.linear_error)):
@@ -284,13 +420,15 @@ def _errors(responses: Sequence[Response]) -> list[_Errors]:
             for error in (response.error, response.linear_error)
         )
         blocks = in_blocks(squares)
+        own = np.maximum(response.scored.std(axis=0), y) / scale
         found.append(
             _Errors(
                 response,
                 np.array([block.sum() for block in blocks]),
                 np.array([block.sum() for block in in_blocks(linear)]),
                 np.array([len(block) for block in blocks]),
-                float(np.mean(np.var(response.scored / scale, axis=0))),
+                float(np.mean(own**2)),
+                has_settled(response, (u, y)),
             )
         )
     return found

@@ -16,7 +16,7 @@ from lfrtorch.reporting.evaluation import CROSS, Response
 from lfrtorch.reporting.verdict import Kind, Verdict
 
 judge = partial(verdict.judge, linear_nx=2)
-reconsidered = partial(verdict.reconsidered, linear_nx=2)
+judge_predictions = partial(verdict.judge_predictions, linear_nx=2)
 LONG = "a_measurement_with_a_name_that_is_longer_than_any_line_of_a_terminal" * 2
 
 
@@ -155,30 +155,96 @@ def test_a_failed_search_is_no_model():
 
 
 @pytest.mark.parametrize(
-    ("ahead", "simulated", "kind", "said"),
+    ("parts", "kind", "said"),
     [
-        (0.78, 0.69, "better", "error 10 ahead is 78.0 % of the linear model's, 97.0 % one"),
-        (0.97, 0.69, "better", "simulation error is 69.0 % of the linear model's, 97.0 % one"),
-        (0.97, 0.97, "linear", "use the linear model"),
-        (0.78, 1.50, "linear", "use the linear model"),
-        (0.78, np.inf, "linear", "use the linear model"),
+        ((0.97, 0.78, 0.69), "better", "error 10 ahead is 78.0 % of the linear model's, 97.0"),
+        ((0.97, 0.97, 0.69), "better", "error 100 ahead is 69.0 % of the linear model's, 97.0"),
+        ((0.97, 0.97, 0.97), "linear", "use the linear model"),
+        ((0.97, 0.78, 1.50), "linear", "use the linear model"),
+        ((0.97, 0.78, np.inf), "linear", "use the linear model"),
+        ((0.68, 0.78, 0.95), "better", "1, 10 and 100 samples ahead are 68.0, 78.0 and 95.0 % of"),
+        ((0.68, 0.78, 15.0), "worse", "68.0 % of its, but 15.0 times as large 100 samples ahead"),
+        ((0.68, 1.30, 0.90), "worse", "68.0 % of its, but 1.30 times as large 10 samples ahead"),
+        ((0.68, 0.78, np.nan), "diverges", "but it diverges 100 samples ahead; use the"),
+        ((3.00, 0.50, 0.50), "worse", "prediction error is 3.00 times as large"),
     ],
-)
-def test_models_that_predict_alike_are_judged_farther_ahead(ahead, simulated, kind, said):
-    first, *others = (
-        [TRAIN, response("test", part, name=LONG)] for part in (0.97, ahead, simulated)
-    )
-    views: dict[str, Any] = dict(zip(("error 10 ahead", "simulation error"), others, strict=True))
-    found = reconsidered(judge(result(), first, error="prediction error"), result(), views)
+)  # fmt: skip
+def test_predictions_are_judged_near_and_far(parts, kind, said):
+    views = {
+        ahead: [TRAIN, response("test", part, name=LONG)]
+        for ahead, part in zip((1, 10, 100), parts, strict=True)
+    }
+    found = judge_predictions(result(), views)
     assert found.kind == kind
     assert said in found.text
     assert len(found.text) <= 160
+    assert (found.use == "NL-LFR") == (kind == "better")
 
 
-def test_what_is_clear_one_sample_ahead_stays():
-    for part in (0.5, 3.0, np.nan):
-        first = judge(result(), [TRAIN, response("test", part)], error="prediction error")
-        assert reconsidered(first, result(), {"error": [TRAIN, response("test", 0.5)]}) is first
+def test_where_nothing_can_be_foreseen_a_small_loss_is_none():
+    near, far = response("test", 0.7), response("test", 1.1, linear=3.0)
+    assert judge_predictions(result(), {1: [TRAIN, near], 100: [TRAIN, far]}).kind == Kind.BETTER
+    lost = response("test", 1e5, linear=3.0)
+    assert judge_predictions(result(), {1: [TRAIN, near], 100: [TRAIN, lost]}).kind == Kind.WORSE
+
+
+@pytest.mark.parametrize("part", [0.1, 0.97])
+def test_a_model_with_smaller_errors_can_be_refused(part: float):
+    refusal = verdict.Refusal("it does not forget where it began")
+    responses = [TRAIN, response("test", part, name=LONG)]
+    found = judge(result(), responses, error="prediction error", refusals=[refusal])
+    assert found.use == "linear model"
+    assert (found.kind == "worse") == (refusal.text in found.text) == (part == 0.1)
+    assert len(found.text) <= 160
+
+
+def settled(use: str, part: float, *, noise: float = 0.01, name: str = "") -> Response:
+    """The end of a step, where nothing but noise is left, with errors as large as that."""
+    rng = np.random.default_rng(3)
+    y = 2.0 + noise * rng.standard_normal((1000, 1))
+    linear = y + noise * rng.standard_normal((1000, 1))
+    simulated = {"linear": linear, "NL-LFR": y + part * (linear - y)}
+    return Response(Record(np.ones(1000), y, name=name or use), use, simulated)
+
+
+def test_a_test_that_has_settled_shows_no_better_model():
+    found = judge(result(), [TRAIN, settled("test", 0.1)])
+    assert (found.kind, found.use, found.colour) == ("unjudged", "linear model", "grey")
+    assert "test settled and tells the gain alone; use the linear model" in found.text
+    # Other parts that move decide in its place.
+    moving = judge(result(), [TRAIN, response("validation", 0.5), settled("test", 0.1)])
+    assert (moving.kind, moving.use) == ("better", "NL-LFR")
+    assert "on validation" in moving.text
+    assert "(test settled)" in moving.text
+    both = judge(result(), [TRAIN, response("test", 0.5, name="a"), settled("test", 0.1)])
+    assert "settled" not in both.text
+    # A gain that is wrong is seen there.
+    assert judge(result(), [TRAIN, settled("test", 60.0)]).kind == Kind.WORSE
+
+
+def test_an_input_that_goes_on_is_no_end_of_a_step():
+    u = np.random.default_rng(1).standard_normal((1000, 1))
+    quiet = settled("test", 0.1)
+    moved = Response(Record(u, quiet.record.y, name="test"), "test", quiet.simulated)
+    assert judge(result(), [TRAIN, moved]).kind == Kind.BETTER
+
+
+def test_errors_are_relative_to_what_all_records_do():
+    # As large as the deviation of the test, and a hundredth of that in training.
+    u = np.random.default_rng(1).standard_normal((1000, 1))
+    quiet = settled("test", 1.0)
+    moved = Response(Record(u, quiet.record.y, name="test"), "test", quiet.simulated)
+    found = judge(result(), [TRAIN, moved])
+    assert (found.kind, found.use) == ("linear", "linear model")
+    assert found.evidence["linear_nrmse"] == pytest.approx(0.01, rel=0.1)
+
+
+def test_an_opponent_that_is_worse_than_a_constant_is_called_so():
+    found = judge(result(), [TRAIN, response("test", 0.2, linear=1.3)])
+    assert found.text.startswith(
+        "Better than the linear model (nx 2), itself worse than a constant"
+    )
+    assert "constant" not in judge(result(), [TRAIN, response("test", 0.2, linear=0.8)]).text
 
 
 def test_the_training_error_alone_is_no_verdict():
@@ -191,7 +257,7 @@ def test_the_training_error_alone_is_no_verdict():
 def test_outputs_that_rest_are_no_error():
     rest = np.zeros((1000, 1))
     still = Response(Record(rest, rest, name="rest"), "test", {"linear": rest, "NL-LFR": rest})
-    assert judge(result(), [TRAIN, still]).kind == Kind.LINEAR
+    assert judge(result(), [TRAIN, still]).use == "linear model"
 
 
 @pytest.mark.parametrize("part", [0.1, 0.999, 1.0, 12345.6, np.nan])
@@ -208,21 +274,27 @@ def test_a_verdict_is_one_line(part: float, linear: float, use: str):
 
 
 def test_a_linear_model_that_explains_nothing_is_called_so():
-    def entry(use: str, rmse: float, std: float, output: str = "x") -> dict[str, Any]:
-        return {"use": use, "scored": 50, "outputs": [{"output": output, "rmse": rmse, "std": std}]}
-
-    train, good = entry("train", 0.2, 2.0), entry("test", 1.0, 4.0)
-    assert verdict.judge_linear([train, good])["text"] == (
-        "On test the linear model's error is 25.0 % of the standard deviation of the output."
+    good, bad = response("test", 0.0, linear=0.25), response("test", 0.0, linear=2.5)
+    judged = verdict.judge_linear([TRAIN, good])
+    assert judged["text"] == (
+        f"On test the linear model's error is {100 * judged['nrmse']:.1f} % of the standard "
+        "deviation of the output."
     )
-    found = verdict.judge_linear([train, entry("validation", 0.1, 2.0), entry("test", 5.0, 2.0)])
-    assert (found["usable"], found["nrmse"]) == (False, 2.5)
+    assert judged["nrmse"] == pytest.approx(0.25, rel=0.1)
+    found = verdict.judge_linear([TRAIN, response("validation", 0.0), bad])
+    assert not found["usable"]
     assert found["text"].startswith("Not usable: on test ")
-    assert found["text"].endswith(
-        "250 % of the standard deviation of the output (in training 10.0 %)."
-    )
-    assert verdict.judge_linear([train])["on"] == "train"
-    assert not verdict.judge_linear([good, entry("test", np.nan, 1.0, "y")])["usable"]
-    still = entry("test", 0.1, 0.0)  # in which nothing happens
-    assert verdict.judge_linear([train, still])["on"] == "train"
+    assert "of the output, worse than a constant (in training 1" in found["text"]
+    assert verdict.judge_linear([TRAIN])["on"] == "train"
+    lost = Response(good.record, "test", {"linear": np.full((1000, 1), np.nan)})
+    assert not verdict.judge_linear([TRAIN, lost])["usable"]
+    rest = np.zeros((1000, 1))
+    still = Response(Record(rest, rest, name="rest"), "test", {"linear": rest})
     assert verdict.judge_linear([still])["usable"] is None
+
+
+def test_a_linear_model_of_a_step_is_usable():
+    found = verdict.judge_linear([TRAIN, settled("test", 1.0)])
+    assert found["usable"]
+    assert found["nrmse"] == pytest.approx(0.01, rel=0.1)
+    assert found["text"].endswith("; test has settled and tells the gain alone.")
