@@ -24,6 +24,7 @@ from lfrtorch.model import Model, load, simulate_blocks
 
 # fits
 from lfrtorch.fitting.distillation import distil
+from lfrtorch.fitting.forgetting import Memory, forgets
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.noise_estimate import estimate_noise
@@ -64,6 +65,7 @@ __all__ = [
     "LfrtorchError",
     "LinearFit",
     "LinearModel",
+    "Memory",
     "Model",
     "Network",
     "NoiseCovariance",
@@ -90,6 +92,7 @@ __all__ = [
     "estimate_noise",
     "export",
     "fit",
+    "forgets",
     "identify",
     "initialise",
     "load",

@@ -26,6 +26,7 @@ from lfrtorch.files.split import cut
 from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.exclusions import allowed
 from lfrtorch.fitting.first_fit import begun_on_part, part_of
+from lfrtorch.fitting.forgetting import forgets
 from lfrtorch.fitting.from_outputs import (
     begins_at_outputs,
     begun_on_short_windows,
@@ -64,7 +65,7 @@ from lfrtorch.reporting.evaluation import (
 from lfrtorch.reporting.opponent import Opponents, opponents
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import metrics
-from lfrtorch.reporting.verdict import judge, judge_predictions
+from lfrtorch.reporting.verdict import REMEMBERS, judge, judge_predictions
 
 _CUT = 0.2, 0.2
 """Parts of a record for validation and test."""
@@ -345,9 +346,14 @@ def scored_run(
     judged = simulations = evaluation.simulations
     ahead = settings.horizon if begins_at_outputs(dataset.train) else None
     opponent = opposed[None]
+    memory = None
+    if settings.noise == "output" and settings.horizon is None:
+        seen = dataset.train if again is None else estimation_records(dataset)
+        memory = forgets((again or result).model, seen, opponent)
+    refusals = [REMEMBERS] if memory is not None and not memory.right else []
     if settings.noise == "output" or in_turn:
         error = "error" if ahead is None else f"error {ahead} samples ahead"
-        verdict = judge(result, simulations, linear_nx=opponent.nx, error=error)
+        verdict = judge(result, simulations, linear_nx=opponent.nx, error=error, refusals=refusals)
     else:
         opponent = opposed[HORIZONS[0]]
         judged = evaluation.predictions[HORIZONS[0]]
@@ -380,6 +386,7 @@ def scored_run(
         refit=again,
         residuals=residuals,
         parameters=known,
+        memory=memory,
     )
     return Run(
         dataset=dataset,
@@ -392,6 +399,7 @@ def scored_run(
         evaluation=evaluation,
         residuals=residuals,
         parameters=known,
+        memory=memory,
         metrics=numbers,
         verdict=verdict,
         advice=advise(found),

@@ -27,7 +27,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import product
+from itertools import chain, product
 from math import isfinite, nan, sqrt
 from threading import Event
 from typing import Any, NamedTuple
@@ -82,6 +82,8 @@ _FLOOR = 1e-6  # error over the outputs' deviation below which models are alike
 _DENSEST = 0.5  # net parameters for each scored output, at most
 
 _WORSE = 1.3  # error over the best of the larger ridges; twice in a row, smaller ones are not tried
+
+_LEADERS = 2  # orders whose best sizes are enlarged
 
 _GAIN = 0.98  # error over the linear model's, or the last best one's, that larger sizes need
 
@@ -274,19 +276,23 @@ def choose_sizes(
         done = percent(min(1.0, 1.0 - left / budget)) if budget else "all"
         watch(f"sizes: {text}: {error}, {seconds}, {done} of the search's work")
 
-    def leader() -> Candidate | None:
+    def leaders() -> list[Candidate]:
+        """Return the best candidates of the two best orders."""
         finite = [c for c in tried if isfinite(c.ratio)]
         ratios = ranks.first(torch.tensor([c.ratio for c in finite], dtype=torch.float64))
-        return finite[int(ratios.argmin())] if finite else None
+        found: dict[int, Candidate] = {}
+        for i in ratios.argsort(stable=True).tolist():
+            found.setdefault(finite[i].sizes["nx"], finite[i])
+        return [*found.values()][:_LEADERS]
 
     names = ("nz", "nw", last)
     try:
         for nx, small in product([given["nx"]] if "nx" in given else _first(base.nx), _SMALL):
             attempt({"nx": nx, **{name: given.get(name, small[name]) for name in names}})
         before = 1.0
-        while (best := leader()) and best.ratio < _GAIN * before and left > 0.0:
-            before = best.ratio
-            for change in _larger(best.sizes, given, last):
+        while (best := leaders()) and best[0].ratio < _GAIN * before and left > 0.0:
+            before = best[0].ratio
+            for change in chain(*(_larger(each.sizes, given, last) for each in best)):
                 attempt(change)
     except StoppedError:
         if not tried:
@@ -328,9 +334,10 @@ def _budget(rows: int) -> float:
 
 
 def _first(order: int) -> list[int]:
-    """Return the orders tried first: the linear model's, one more, and much lower ones."""
+    """Return the orders tried first: the linear model's, those beside it, and much lower ones."""
     # A linear model takes more states than the system has where the system is nonlinear.
-    return sorted({order, order + 1} | {low for low in (2, 4) if order > low + 1})
+    beside = {max(1, order - 1), order, order + 1}
+    return sorted(beside | {low for low in (2, 4) if order > low + 1})
 
 
 def _larger(sizes: Sizes, given: Mapping[str, int], last: str) -> Iterator[Sizes]:

@@ -41,7 +41,8 @@ _SAMPLES = 60_000  # of all records together: the longest come first
 
 _SLOWER = 2.0  # distance over the linear model's that is no fault
 
-_NEAR = 0.5  # deviations of the states within which a state was visited, for each state's root
+_NEAR = 2.0  # distance to visited states over that of these to those of other parts, the medians
+_PARTS = 8  # of the records' states in time
 _LOOKED_AT = 200  # states at the end of a trajectory that is apart
 
 
@@ -156,10 +157,19 @@ def _apart(
 
 
 def _visited(ends: Sequence[Tensor], paths: Sequence[Tensor]) -> bool:
-    """Whether the ends of trajectories are among the states of the records' own."""
-    visited = np.concatenate([path.numpy() for path in paths])
-    deviation = visited.std(axis=0)
+    """Whether the ends of trajectories are as near the records' own states as these to others."""
+    states = np.concatenate([path.numpy() for path in paths])
+    deviation = states.std(axis=0)
     deviation = np.where(deviation > 0.0, deviation, 1.0)
-    tree = KDTree(visited / deviation)
-    near = _NEAR * np.sqrt(visited.shape[1])
-    return all(np.quantile(tree.query(end.numpy() / deviation)[0], 0.9) <= near for end in ends)
+    parts = np.array_split(states / deviation, _PARTS)
+    trees = [KDTree(part) for part in parts]
+    usual = np.concatenate(
+        [
+            np.min([tree.query(part)[0] for tree in trees if tree is not own], axis=0)
+            for part, own in zip(parts, trees, strict=True)
+        ]
+    )
+    near = [
+        np.min([tree.query(end.numpy() / deviation)[0] for tree in trees], axis=0) for end in ends
+    ]
+    return all(np.median(each) <= _NEAR * np.median(usual) for each in near)

@@ -13,7 +13,6 @@ import numpy as np
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import percent
-from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import scan_orders
 from lfrtorch.metrics import rms
 from lfrtorch.records import Record

@@ -93,6 +93,7 @@ def render(
             [name, " × ".join(map(str, w.shape)), w.numel()] for name, w in groups if w.numel()
         ],
         stability=stability(run.metrics["stable_to"]),
+        memory="" if run.memory is None else str(run.memory),
         facts=_facts(run),
     )
 

@@ -12,6 +12,7 @@ from lfrtorch.analysis.physical_parameters import PhysicalParameters
 from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.choice import Choice
+from lfrtorch.fitting.forgetting import Memory
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
@@ -39,6 +40,8 @@ class Run:
         evaluation: both models on every record.
         residuals: of the record with the largest error, as the report shows them.
         parameters: of the known model, if the settings have one.
+        memory: whether the simulation forgets where it began; None for fits to predictions and
+            windows.
         metrics: what ``metrics.json`` holds: scores by record, sizes, the fit in numbers.
         verdict: whether the NL-LFR is worth more than the linear model.
         advice: what to try next, the most useful first.
@@ -63,6 +66,7 @@ class Run:
     evaluation: Evaluation
     residuals: Residuals | None = None
     parameters: PhysicalParameters | None = None
+    memory: Memory | None = None
     metrics: Mapping[str, Any]
     verdict: Verdict
     advice: list[Advice]
@@ -97,4 +101,6 @@ class Run:
             parts.append(f"\n{self.parameters}\n")
         if self.metrics["stable_to"] < max(LOUDER):
             parts.append(f"note: {scores.stability(self.metrics['stable_to'])}")
+        if self.memory is not None and not self.memory.fades:
+            parts.append(f"note: {self.memory}")
         return "\n".join(parts)

@@ -16,6 +16,7 @@ from lfrtorch.analysis.physical_parameters import PhysicalParameters
 from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.dataset import LISTED, Published
 from lfrtorch.fitting.choice import Choice
+from lfrtorch.fitting.forgetting import Memory
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.records import common_unit
 from lfrtorch.reporting.evaluation import HORIZONS, Evaluation
@@ -38,6 +39,7 @@ def metrics(
     refit: FitResult | None = None,
     residuals: Residuals | None = None,
     parameters: PhysicalParameters | None = None,
+    memory: Memory | None = None,
 ) -> dict[str, Any]:
     """What ``metrics.json`` holds of a fit, but for its origin; None for what is not finite."""
     # A model fitted again is scored on the tests; validation errors are those before it.
@@ -69,6 +71,7 @@ def metrics(
         "known": {} if parameters is None else parameters.entries(),
         "residuals": {} if residuals is None else residuals.entries(),
         "stable_to": largest_stable_amplitude(model, dataset.train),
+        "memory": None if memory is None else memory._asdict(),
         "starts": max(1, len(result.starts)),
         "averaged": result.averaged,
         "distilled": result.distilled,

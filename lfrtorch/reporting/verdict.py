@@ -7,8 +7,9 @@ clear if it is beyond Student's quantile, or if one error is twice the other: on
 that runs away has a large standard error, and is no chance. A difference below 5 % of the error is
 none. What was left out in turn is the whole record, each stretch judged by models that were chosen
 without it: there 2.25 standard errors and 1 % are enough (``benchmarks/first_try.md``). There one
-stretch in which the choice without it is poor may have most of the error; so it is enough, too, if
-the mean of the blocks' own log ratios is clear by 3 standard errors, and the whole ratio below 1.
+stretch in which a model runs away may have most of the error. It neither hides nor makes a verdict:
+the mean of the blocks' own log ratios, each of a factor 2 at most, has to point the same way, and
+is enough by itself if it is below 0.8 by 2 standard errors.
 
 A part in which inputs and outputs stand still, as the end of a step test, tells the gain alone. It
 can show that a model is worse, and not that it is better: that is said of the parts that move.
@@ -40,7 +41,8 @@ SAME = 0.05
 """Difference of the errors, relative to the linear model's, below which neither is preferred."""
 
 _CROSS_SAME, _CROSS_CLEAR = 0.01, 2.25  # likewise, and the standard errors, in cross-validation
-_CROSS_TYPICAL = 3.0  # and those of the mean log ratio of the blocks
+_TYPICAL, _TYPICAL_CLEAR = 0.8, 2.0  # likewise, of the mean log ratio of the blocks
+_LEAST_ERROR = 1e-3  # of that mean: blocks may all have the same ratio
 
 _CLEAR = 2.0  # ratio of two errors that is no chance, whatever its standard error
 
@@ -100,6 +102,10 @@ class Refusal(NamedTuple):
     kind: Kind = Kind.WORSE  # what the verdict comes to
 
 
+REMEMBERS = Refusal("it does not forget where it began", Kind.LINEAR)
+"""Of a model whose output depends on its start for ever, where the records show no such thing."""
+
+
 class _Compared(NamedTuple):
     """The NL-LFR beside the linear model on one record or several, each output counting alike."""
 
@@ -111,19 +117,28 @@ class _Compared(NamedTuple):
     nrmse: float  # error over the output's standard deviation
     linear_nrmse: float
     same: float = SAME  # difference of the errors that is none
+    cross: bool = False  # whether each stretch has models of its own
+    middle: float = 1.0  # mean ratio of the blocks, geometric, each between 1/2 and 2
     typical: bool = False  # whether it is clearly smaller in most blocks of cross-validation
 
     @property
     def worse(self) -> bool:
         """Whether the NL-LFR's error is clearly larger."""
         certain = self.deviations > self.clear or self.ratio >= _CLEAR
-        return certain and self.ratio > 1.0 + SAME
+        return certain and self.ratio > 1.0 + SAME and not (self.cross and self.middle <= 1.0)
 
     @property
     def better(self) -> bool:
         """Whether it is clearly smaller."""
-        certain = self.deviations < -self.clear or self.typical or self.ratio <= 1.0 / _CLEAR
-        return certain and self.ratio < 1.0 - self.same
+        certain = self.deviations < -self.clear or self.ratio <= 1.0 / _CLEAR
+        whole = certain and self.ratio < 1.0 - self.same
+        # In cross-validation the runaway of one model in one stretch decides nothing.
+        return self.typical or (whole and not (self.cross and self.middle >= 1.0))
+
+    @property
+    def said(self) -> float:
+        """The ratio to speak of: that of the blocks if a runaway hides it."""
+        return self.middle if self.typical and self.ratio > self.middle else self.ratio
 
 
 class _Errors(NamedTuple):
@@ -182,7 +197,9 @@ def judge(
     moving = [e for e in held_out if not e.settled]
     judged = [e for e in moving if e.response.use == "test"] or moving or tests or held_out
     still = [e.response for e in tests or held_out if e.settled]
-    every = [_compared([e], len(held_out)) for e in held_out]
+    every = [_compared([e], len(held_out)) for e in held_out if not _is_cross(e)]
+    if cross := [e for e in held_out if _is_cross(e)]:
+        every.append(_compared(cross))
     whole = _compared(judged or errors) if errors else None
     evidence = {} if whole is None else _numbers(whole)
     evidence |= {"records": [_numbers(c) for c in every], "diverges": [_name(r) for r in lost]}
@@ -259,14 +276,14 @@ def _better(case: _Case) -> _Found | None:
         return None
     for refusal in case.refusals:
         text = (
-            f"Not better than {case.linear}: the {case.error} is {percent(whole.ratio)} of its, "
+            f"Not better than {case.linear}: the {case.error} is {percent(whole.said)} of its, "
             f"but {refusal.text}"
         )
         return refusal.kind, LINEAR_MODEL, text
     still = f" ({case.settled} settled)" if case.settled else ""
     constant = ", itself worse than a constant" if whole.linear_nrmse > 1.0 else ""
     text = f"Better than {case.linear}{constant}: on {whole.name} the NL-LFR's {case.error} is " + (
-        f"{percent(whole.ratio)} of its" if constant or still else of_linear(whole.ratio)
+        f"{percent(whole.said)} of its" if constant or still else of_linear(whole.said)
     )
     return Kind.BETTER, NL_LFR, text + still
 
@@ -456,7 +473,8 @@ def _compared(
     power = float(np.dot([e.power for e in errors], samples)) or math.nan
     first = errors[0].response
     several = f"{len(errors)} {_use(first)} records"
-    cross = all(e.response.record.name.endswith(CROSS) for e in errors)
+    cross = all(map(_is_cross, errors))
+    middle, far = _in_the_middle(squares, linear)
     clear = stdtrit(len(counts) - 1, 1.0 - (1.0 - CONFIDENCE) / max(1, among))
     return _Compared(
         name=_name(first) if len(errors) == 1 else several,
@@ -467,15 +485,27 @@ def _compared(
         nrmse=math.sqrt(sum(e.squares.sum() for e in errors) / power),
         linear_nrmse=math.sqrt(sum(e.linear.sum() for e in errors) / power),
         same=_CROSS_SAME if cross else SAME,
-        typical=cross and _typical(squares, linear),
+        cross=cross,
+        middle=math.exp(middle),
+        typical=cross and middle < math.log(_TYPICAL) and far < -_TYPICAL_CLEAR,
     )
 
 
-def _typical(squares: Array, linear: Array) -> bool:
-    """Whether the mean log ratio over the blocks is clearly below 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        logs = np.log(squares / linear)
-        return bool(logs.mean() < -_CROSS_TYPICAL * logs.std(ddof=1) / math.sqrt(len(logs)))
+def _is_cross(errors: _Errors) -> bool:
+    """Whether it is of cross-validation, each stretch by other models."""
+    return errors.response.record.name.endswith(CROSS)
+
+
+def _in_the_middle(squares: Array, linear: Array) -> tuple[float, float]:
+    """Return the mean log ratio of the errors over the blocks, and its standard errors from 0.
+
+    A ratio beyond 2 or 1/2 counts as that: a block in which one model runs away is one of many.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        logs = 0.5 * np.log(squares / linear)
+    logs = np.clip(np.nan_to_num(logs), -math.log(_CLEAR), math.log(_CLEAR))
+    error = max(float(logs.std(ddof=1)) / math.sqrt(len(logs)), _LEAST_ERROR)
+    return float(logs.mean()), float(logs.mean()) / error
 
 
 def _numbers(compared: _Compared) -> dict[str, Any]:

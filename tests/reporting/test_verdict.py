@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 
 from lfrtorch._support.reasons import Reason
 from lfrtorch.fitting.trainer import FitResult
+from lfrtorch.metrics import rms
 from lfrtorch.records import Record
 from lfrtorch.reporting import verdict
 from lfrtorch.reporting.evaluation import CROSS, Response
@@ -104,7 +106,7 @@ def test_better_in_every_block_is_better_where_one_resonance_has_the_error():
 
 @pytest.mark.parametrize(
     ("poor", "cross", "other"),
-    [(2.2, Kind.BETTER, Kind.LINEAR), (3.4, Kind.LINEAR, Kind.LINEAR)],
+    [(2.2, Kind.BETTER, Kind.LINEAR), (30.0, Kind.BETTER, Kind.WORSE)],
 )
 def test_one_poor_stretch_does_not_decide_in_cross_validation(
     poor: float, cross: Kind, other: Kind
@@ -115,6 +117,17 @@ def test_one_poor_stretch_does_not_decide_in_cross_validation(
         for name in (CROSS, "other")
     ]
     assert kinds == [cross, other]
+
+
+def test_a_runaway_of_the_linear_model_in_one_stretch_is_no_merit_of_the_other():
+    """Elsewhere the NL-LFR is worse: by the error of all it is better by far."""
+    whole = response("validation", 1.1, name=CROSS)
+    there = np.arange(1000)[:, None] // 100 == 4
+    y_linear = np.where(there, whole.y_linear + 10.0, whole.y_linear)
+    y_hat = np.where(there, whole.record.y, whole.y_hat)
+    found = replace(whole, simulated={"linear": y_linear, "NL-LFR": y_hat})
+    assert rms(found.error) < 0.1 * rms(found.linear_error)
+    assert judge(result(), [TRAIN, found]).kind == Kind.LINEAR
 
 
 @pytest.mark.parametrize("part", [0.1, 0.8, 3.0])
