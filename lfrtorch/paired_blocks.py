@@ -40,11 +40,17 @@ BLOCKS = 10
 """Least number of blocks of time, over all records."""
 
 
-def as_good(squares: Sequence[Array] | Array, counts: Integers) -> Booleans:
-    """Return which models are within one standard error of the best and 5 %, or ``MARGIN``."""
+def as_good(
+    squares: Sequence[Array] | Array, counts: Integers, *, errors: float = 1.0, most: float = 1.05
+) -> Booleans:
+    """Return which models do as well as the best.
+
+    Their mean squares are within so many standard ``errors`` of the least and their rms errors at
+    most ``most`` times as large, or within ``MARGIN``.
+    """
     means = np.asarray(squares).sum(axis=1)
-    near = standard_errors_above(squares, counts) <= 1.0
-    near &= means <= 1.05**2 * means.min()
+    near = standard_errors_above(squares, counts) <= errors
+    near &= means <= most**2 * means.min()
     return near | (means <= (1.0 + MARGIN) ** 2 * means.min())
 
 
@@ -90,16 +96,16 @@ def squares_in_blocks(errors: Sequence[Array]) -> Array:
     return sums if np.isfinite(sums).all() else np.full(len(sums), inf)
 
 
-def in_blocks(signals: Sequence[Array]) -> list[Array]:
-    """Cut signals (T,) into blocks of about equal length, ``BLOCKS`` of them or a few more."""
+def in_blocks(signals: Sequence[Array], count: int = BLOCKS) -> list[Array]:
+    """Cut signals (T,) into blocks of about equal length, ``count`` of them or a few more."""
     samples = sum(map(len, signals))
-    if samples < BLOCKS:
+    if samples < count:
         raise InputError(
             f"the validation records have {samples} scored samples; sizes are chosen with "
-            f"{BLOCKS} at least. Give longer records, or set the sizes."
+            f"{count} at least. Give longer records, or set the sizes."
         )
     return [
         block
         for signal in signals
-        for block in np.array_split(signal, ceil(BLOCKS * len(signal) / samples))
+        for block in np.array_split(signal, ceil(count * len(signal) / samples))
     ]

@@ -27,7 +27,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain, product
+from itertools import product
 from math import isfinite, nan, sqrt
 from threading import Event
 from typing import Any, NamedTuple
@@ -83,7 +83,9 @@ _DENSEST = 0.5  # net parameters for each scored output, at most
 
 _WORSE = 1.3  # error over the best of the larger ridges; twice in a row, smaller ones are not tried
 
-_LEADERS = 2  # orders whose best sizes are enlarged
+_ERRORS, _MOST = 2.0, 1.3
+"""Standard errors, and ratio of rms errors, within which a size is as good as the best: the least
+of many errors is small by chance, too."""
 
 _GAIN = 0.98  # error over the linear model's, or the last best one's, that larger sizes need
 
@@ -165,8 +167,7 @@ LEGEND = """\
 / linear: rms error where it was left out over the linear model's. It compares sizes: the least of
 many is smaller than on new data.
 above best: in standard errors of the difference.
-chosen: the fewest net parameters with 1 at most and an error up to 5 % above the best, or with an
-error up to 1 % above it."""
+chosen: the fewest net parameters with 2 at most and an error up to 30 % above the best."""
 
 
 def choice_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
@@ -260,7 +261,8 @@ def choose_sizes(
     def attempt(sizes: Sizes) -> None:
         nonlocal left
         key = tuple(sizes.values())
-        if key in begun or (tried and left <= 0.0) or not study.has_order(sizes["nx"]):
+        spent = len(begun) >= len(_SMALL) and left <= 0.0
+        if key in begun or spent or not study.has_order(sizes["nx"]):
             return
         begun.add(key)
         since = time.perf_counter()
@@ -276,28 +278,24 @@ def choose_sizes(
         done = percent(min(1.0, 1.0 - left / budget)) if budget else "all"
         watch(f"sizes: {text}: {error}, {seconds}, {done} of the search's work")
 
-    def leaders() -> list[Candidate]:
-        """Return the best candidates of the two best orders."""
+    def leader() -> Candidate | None:
         finite = [c for c in tried if isfinite(c.ratio)]
         ratios = ranks.first(torch.tensor([c.ratio for c in finite], dtype=torch.float64))
-        found: dict[int, Candidate] = {}
-        for i in ratios.argsort(stable=True).tolist():
-            found.setdefault(finite[i].sizes["nx"], finite[i])
-        return [*found.values()][:_LEADERS]
+        return finite[int(ratios.argmin())] if finite else None
 
     names = ("nz", "nw", last)
     try:
         for nx, small in product([given["nx"]] if "nx" in given else _first(base.nx), _SMALL):
             attempt({"nx": nx, **{name: given.get(name, small[name]) for name in names}})
         before = 1.0
-        while (best := leaders()) and best[0].ratio < _GAIN * before and left > 0.0:
-            before = best[0].ratio
-            for change in chain(*(_larger(each.sizes, given, last) for each in best)):
+        while (best := leader()) and best.ratio < _GAIN * before and left > 0.0:
+            before = best.ratio
+            for change in _larger(best.sizes, given, last):
                 attempt(change)
     except StoppedError:
         if not tried:
             raise
-        watch(f"note: stopped while sizes were chosen: the best of {len(begun) - 1} go on")
+        watch("note: stopped while sizes were chosen: the best so far go on")
     if not tried:
         raise InputError(
             "no NL-LFR of the sizes that were tried can be begun on these records; give longer "
@@ -334,10 +332,9 @@ def _budget(rows: int) -> float:
 
 
 def _first(order: int) -> list[int]:
-    """Return the orders tried first: the linear model's, those beside it, and much lower ones."""
+    """Return the orders tried first: the linear model's, one more, and much lower ones."""
     # A linear model takes more states than the system has where the system is nonlinear.
-    beside = {max(1, order - 1), order, order + 1}
-    return sorted(beside | {low for low in (2, 4) if order > low + 1})
+    return [order, order + 1, *(low for low in (2, 4) if order > low + 1)]
 
 
 def _larger(sizes: Sizes, given: Mapping[str, int], last: str) -> Iterator[Sizes]:
@@ -352,12 +349,17 @@ def _larger(sizes: Sizes, given: Mapping[str, int], last: str) -> Iterator[Sizes
 def _chosen(
     tried: Sequence[Candidate], of: Sequence[int], counts: Integers, ranks: Ranks
 ) -> Candidate:
-    """Return the fewest parameters that do as well as the best in some folds, and most ridge."""
-    # Of a size the largest ridge was tried first.
+    """Return the fewest parameters that do as well as the best in some folds."""
     squares = np.array([c.squares[list(of)].ravel() for c in tried])
     squares = ranks.first(torch.from_numpy(squares)).numpy()
-    good = as_good(squares, counts[list(of)].ravel())
-    near = [c for c, enough in zip(tried, good, strict=True) if enough] or tried  # all diverge
+    blocks = counts[list(of)].ravel()
+    sizes: dict[tuple[int, ...], list[int]] = {}
+    for i, candidate in enumerate(tried):
+        sizes.setdefault(tuple(candidate.sizes.values()), []).append(i)
+    # Of a size the largest ridge was tried first. If all diverge, none is as good as another.
+    best = [own[int(np.argmax(as_good(squares[own], blocks)))] for own in sizes.values()]
+    good = as_good(squares[best], blocks, errors=_ERRORS, most=_MOST)
+    near = [tried[i] for i, enough in zip(best, good, strict=True) if enough or not good.any()]
     return min(near, key=lambda c: c.parameters_net)
 
 

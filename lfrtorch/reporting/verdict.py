@@ -8,7 +8,7 @@ that runs away has a large standard error, and is no chance. A difference below 
 none. What was left out in turn is the whole record, each stretch judged by models that were chosen
 without it: there 2.25 standard errors and 1 % are enough (``benchmarks/first_try.md``). There one
 stretch in which a model runs away may have most of the error. It neither hides nor makes a verdict:
-the mean of the blocks' own log ratios, each of a factor 2 at most, has to point the same way, and
+the mean of the blocks' own log ratios, each of a factor 3 at most, has to point the same way, and
 is enough by itself if it is below 0.8 by 2 standard errors.
 
 A part in which inputs and outputs stand still, as the end of a step test, tells the gain alone. It
@@ -42,6 +42,8 @@ SAME = 0.05
 
 _CROSS_SAME, _CROSS_CLEAR = 0.01, 2.25  # likewise, and the standard errors, in cross-validation
 _TYPICAL, _TYPICAL_CLEAR = 0.8, 2.0  # likewise, of the mean log ratio of the blocks
+_MOST = 3.0  # ratio of a block that counts, and its inverse
+_CROSS_BLOCKS = 16  # of a record: four in each stretch
 _LEAST_ERROR = 1e-3  # of that mean: blocks may all have the same ratio
 
 _CLEAR = 2.0  # ratio of two errors that is no chance, whatever its standard error
@@ -118,7 +120,7 @@ class _Compared(NamedTuple):
     linear_nrmse: float
     same: float = SAME  # difference of the errors that is none
     cross: bool = False  # whether each stretch has models of its own
-    middle: float = 1.0  # mean ratio of the blocks, geometric, each between 1/2 and 2
+    middle: float = 1.0  # mean ratio of the blocks, geometric, each between 1/3 and 3
     typical: bool = False  # whether it is clearly smaller in most blocks of cross-validation
 
     @property
@@ -197,8 +199,8 @@ def judge(
     moving = [e for e in held_out if not e.settled]
     judged = [e for e in moving if e.response.use == "test"] or moving or tests or held_out
     still = [e.response for e in tests or held_out if e.settled]
-    every = [_compared([e], len(held_out)) for e in held_out if not _is_cross(e)]
-    if cross := [e for e in held_out if _is_cross(e)]:
+    every = [_compared([e], len(held_out)) for e in held_out if not _is_cross(e.response)]
+    if cross := [e for e in held_out if _is_cross(e.response)]:
         every.append(_compared(cross))
     whole = _compared(judged or errors) if errors else None
     evidence = {} if whole is None else _numbers(whole)
@@ -436,13 +438,14 @@ def _errors(responses: Sequence[Response], every: Sequence[Response]) -> list[_E
             [np.mean((error / scale) ** 2, axis=1)]
             for error in (response.error, response.linear_error)
         )
-        blocks = in_blocks(squares)
+        count = _CROSS_BLOCKS if _is_cross(response) else BLOCKS
+        blocks = in_blocks(squares, min(count, len(response.scored)))
         own = np.maximum(response.scored.std(axis=0), y) / scale
         found.append(
             _Errors(
                 response,
                 np.array([block.sum() for block in blocks]),
-                np.array([block.sum() for block in in_blocks(linear)]),
+                np.array([block.sum() for block in in_blocks(linear, len(blocks))]),
                 np.array([len(block) for block in blocks]),
                 float(np.mean(own**2)),
                 has_settled(response, (u, y)),
@@ -473,7 +476,7 @@ def _compared(
     power = float(np.dot([e.power for e in errors], samples)) or math.nan
     first = errors[0].response
     several = f"{len(errors)} {_use(first)} records"
-    cross = all(map(_is_cross, errors))
+    cross = all(_is_cross(e.response) for e in errors)
     middle, far = _in_the_middle(squares, linear)
     clear = stdtrit(len(counts) - 1, 1.0 - (1.0 - CONFIDENCE) / max(1, among))
     return _Compared(
@@ -491,19 +494,19 @@ def _compared(
     )
 
 
-def _is_cross(errors: _Errors) -> bool:
+def _is_cross(response: Response) -> bool:
     """Whether it is of cross-validation, each stretch by other models."""
-    return errors.response.record.name.endswith(CROSS)
+    return response.record.name.endswith(CROSS)
 
 
 def _in_the_middle(squares: Array, linear: Array) -> tuple[float, float]:
     """Return the mean log ratio of the errors over the blocks, and its standard errors from 0.
 
-    A ratio beyond 2 or 1/2 counts as that: a block in which one model runs away is one of many.
+    A ratio beyond 3 or 1/3 counts as that: a block in which one model runs away is one of many.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         logs = 0.5 * np.log(squares / linear)
-    logs = np.clip(np.nan_to_num(logs), -math.log(_CLEAR), math.log(_CLEAR))
+    logs = np.clip(np.nan_to_num(logs), -math.log(_MOST), math.log(_MOST))
     error = max(float(logs.std(ddof=1)) / math.sqrt(len(logs)), _LEAST_ERROR)
     return float(logs.mean()), float(logs.mean()) / error
 

@@ -162,6 +162,42 @@ def test_a_stop_before_the_first_sizes_ends_the_choice():
         chosen(measured(1.0), stop=lambda: True)
 
 
+@pytest.mark.usefixtures("short_paths")
+def test_a_stop_later_keeps_the_best_sizes_so_far():
+    said = list[str]()
+
+    def stop() -> bool:
+        return any(text.startswith("sizes:") for text in said)
+
+    found = chosen(measured(2.0), stop=stop, watch=said.append)
+    assert len({tuple(c.sizes.values()) for c in found.candidates}) == 1
+    assert found.chosen in found.candidates
+    assert "note: stopped while sizes were chosen: the best so far go on" in said
+
+
+@pytest.mark.usefixtures("short_paths")
+def test_sizes_that_do_not_forget_where_they_began_are_refused(monkeypatch):
+    def memory(model: Model, *_: Any) -> lfrtorch.Memory:
+        return lfrtorch.Memory(1.0 if model.sizes["nn"] == 8 else 0.0)
+
+    monkeypatch.setattr(procedure, "forgets", memory)
+    said = list[str]()
+    found = chosen(measured(2.0), watch=said.append)
+    remember = [c for c in found.candidates if c.sizes["nn"] == 8]
+    assert remember
+    assert all(c.remembers and c.ratio == np.inf for c in remember)
+    assert found.chosen.sizes["nn"] != 8
+    assert any(f"note: {len(remember)} of {len(found.candidates)} candidates" in t for t in said)
+
+
+@pytest.mark.usefixtures("short_paths")
+def test_where_all_sizes_run_away_the_smallest_is_chosen_and_has_no_error(monkeypatch):
+    monkeypatch.setattr(procedure, "forgets", lambda *_: lfrtorch.Memory(np.inf))
+    found = chosen(measured(2.0))
+    assert found.chosen.parameters_net == min(c.parameters_net for c in found.candidates)
+    assert not np.isfinite(nested(found))
+
+
 def test_table_has_a_line_for_each_size_and_marks_the_chosen(saturating: Choice):
     lines = saturating.table().splitlines()
     sizes = {tuple(c.sizes.values()) for c in saturating.candidates}
