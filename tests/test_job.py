@@ -75,6 +75,9 @@ def test_the_job_scores_every_record_and_advises(dataset: Dataset):
     assert run.metrics["verdict"]["kind"] == "better"
     assert str(run).startswith(run.verdict.text)
     assert run.advice
+    assert run.memory is not None
+    assert run.memory.fades
+    assert run.metrics["memory"]["apart"] == run.memory.apart < 0.02
     assert {start["seed"] for start in run.metrics["ranking"]} == {1, 1001}
     assert "Simulation RMSE, nx 1, nz 1, nw 1, 3 neurons" in str(run)
     assert repr(run).startswith("Run(saturation, nx=1, nz=1, nw=1, nn=3")
@@ -118,6 +121,17 @@ def test_without_tests_what_was_left_out_judges(dataset: Dataset):
     one = identify(replace(alone, validation=[]), settings(nx=1, nz="auto", nn=3, starts=1))
     assert "on cross-validation the NL-LFR's error is" in one.verdict.text
     assert (run.settings.nx, run.settings.nn) == (1, 3)
+
+
+def test_a_model_that_does_not_forget_where_it_began_is_not_called_better(
+    dataset: Dataset, monkeypatch
+):
+    memory = lfrtorch.Memory(1.5)
+    monkeypatch.setattr("lfrtorch.job.forgets", lambda *_: memory)
+    run = identify(dataset, settings(trainer=LevenbergMarquardt(max_iter=20)))
+    assert (run.verdict.kind, run.verdict.use) == ("linear", "linear model")
+    assert "but it does not forget where it began" in run.verdict.text
+    assert f"note: {memory}" in str(run)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ none. What was left out in turn is the whole record, each stretch judged by mode
 without it: there 2.25 standard errors and 1 % are enough (``benchmarks/first_try.md``). There one
 stretch in which a model runs away may have most of the error. It neither hides nor makes a verdict:
 the mean of the blocks' own log ratios, each of a factor 3 at most, has to point the same way, and
-is enough by itself if it is below 0.8 by 2 standard errors.
+is enough by itself if it is below 0.85 and 2 standard errors below 1.
 
 A part in which inputs and outputs stand still, as the end of a step test, tells the gain alone. It
 can show that a model is worse, and not that it is better: that is said of the parts that move.
@@ -41,7 +41,7 @@ SAME = 0.05
 """Difference of the errors, relative to the linear model's, below which neither is preferred."""
 
 _CROSS_SAME, _CROSS_CLEAR = 0.01, 2.25  # likewise, and the standard errors, in cross-validation
-_TYPICAL, _TYPICAL_CLEAR = 0.8, 2.0  # likewise, of the mean log ratio of the blocks
+_TYPICAL, _TYPICAL_CLEAR = 0.85, 2.0  # likewise, of the mean log ratio of the blocks
 _MOST = 3.0  # ratio of a block that counts, and its inverse
 _CROSS_BLOCKS = 16  # of a record: four in each stretch
 _LEAST_ERROR = 1e-3  # of that mean: blocks may all have the same ratio
