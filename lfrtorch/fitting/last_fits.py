@@ -22,7 +22,7 @@ from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.records import common_unit
 
-_AVERAGED, _POOR = 6, 1.5
+_AVERAGED, _POOR = 3, 2.0
 """Starts of a mean that no held-out record judges, and their training errors over the least, at
 most: the start with the least may be the one that is overfitted (``benchmarks/first_try.md``)."""
 
