@@ -320,11 +320,14 @@ class Record:
         return f"Record({self.name!r}: {signals(self)}, {', '.join(parts)})"
 
     @property
+    def is_valid(self) -> Booleans:
+        """Which outputs (T, ny) are measurements."""
+        return np.ones(self.y.shape, dtype=bool) if self.valid is None else self.valid
+
+    @property
     def scored(self) -> Booleans:
         """Which outputs (T, ny) count: valid ones after the skipped samples."""
-        counts = np.arange(len(self.y))[:, None] >= self.skip
-        counts = counts if self.valid is None else counts & self.valid
-        return np.broadcast_to(counts, self.y.shape)
+        return self.is_valid & (np.arange(len(self.y))[:, None] >= self.skip)
 
     @property
     def scored_samples(self) -> int:
@@ -352,9 +355,7 @@ class Record:
     @property
     def start_factors(self) -> Array:
         """The same for an estimated start of a given model: √weight, 0 in the scored samples."""
-        counts = self.beyond == 0
-        if self.valid is not None:
-            counts = counts & self.valid
+        counts = self.is_valid & (self.beyond == 0)
         if self.skip:
             counts = counts & (np.arange(len(self.y))[:, None] < self.skip)
         return np.sqrt(self.weight) * counts
@@ -388,10 +389,48 @@ class Record:
                 f"record '{self.name}' has line_weight, and a part of it has other lines; cut "
                 "replace(record, line_weight=None), and give the part weights of its own."
             )
-        part = self.signals_in(window)
-        period = self.period if self.period is not None and self.period <= len(part["u"]) else None
+        period = self.period
+        if period is not None and period > len(self.u[window]):
+            period = None
         start = "measured" if self.start == "measured" else "zero"
-        return replace(self, **part, start=start, skip=0, period=period, x0=None)
+        return self.part(window, start=start, skip=0, period=period, x0=None)
+
+    def part(
+        self,
+        window: slice | NDArray[np.integer],
+        *,
+        start: Start,
+        skip: int,
+        period: int | None,
+        **others: Any,
+    ) -> Record:
+        """Return some samples of the record, and how they begin; ``others`` are other fields."""
+        return self.with_signals(
+            **self.signals_in(window), limits=self.limits, start=start, skip=skip, period=period,
+            **others,
+        )  # fmt: skip
+
+    def with_signals(
+        self,
+        *,
+        u: Array,
+        y: Array,
+        reference: Array | None,
+        valid: Booleans | None,
+        limits: Sequence[ArrayLike | None] | Array | None,
+        start: Start,
+        skip: int,
+        period: int | None,
+        **others: Any,
+    ) -> Record:
+        """Return a record of the same kind with other signals; ``others`` are other fields.
+
+        A call names all that depends on the signals, so that none of it stays by mistake.
+        """
+        return replace(
+            self, u=u, y=y, reference=reference, valid=valid, limits=limits, start=start, skip=skip,
+            period=period, **others,
+        )  # fmt: skip
 
     def mean_period(self) -> Record:
         """Return one period, the mean of all P of a record in steady state, with their weight.
@@ -412,16 +451,33 @@ class Record:
             )
         N = self.period or self.samples
         P = self.samples // N
-        means = {
+        means: dict[str, Any] = {
             name: None if signal is None else signal.reshape(P, N, -1).mean(axis=0)
             for name, signal in self.signals_in(slice(None)).items()
         }
         lines = None if self.line_weight is None else self.line_weight[::P]
         weight = P * np.asarray(self.weight)
-        return replace(self, **means, skip=0, weight=weight, line_weight=lines, limits=None)
+        return self.with_signals(
+            **means, limits=None, start="periodic", skip=0, period=self.period, weight=weight,
+            line_weight=lines,
+        )  # fmt: skip
+
+    def joined(self, other: Record) -> Record:
+        """Return the record, and behind it what another one that goes on from it scores."""
+        here, there = (
+            record.signals_in(slice(first, None)) | {"valid": record.is_valid[first:]}
+            for record, first in ((self, 0), (other, other.skip))
+        )
+        both: dict[str, Any] = {
+            name: None if one is None or there[name] is None else np.concatenate([one, there[name]])
+            for name, one in here.items()
+        }
+        return self.with_signals(
+            **both, limits=self.limits, start=self.start, skip=self.skip, period=self.period
+        )
 
     def signals_in(self, window: slice | NDArray[np.integer]) -> dict[str, Any]:
-        """Return the signals in ``window`` by name, for ``dataclasses.replace``."""
+        """Return the signals in ``window`` by name, for ``with_signals``."""
         several = {name: getattr(self, name) for name in ("u", "y", "reference", "valid")}
         return {name: one if one is None else one[window] for name, one in several.items()}
 
@@ -433,6 +489,12 @@ def interpolated(y: Array, valid: Booleans) -> Array:
         if there.any():
             filled[~there, i] = np.interp(k[~there], k[there], y[there, i])
     return filled
+
+
+def measured_signals(record: Record) -> Array:
+    """Inputs, which outputs are measurements, and these (T, nu + 2 ny); 0 for the others."""
+    valid = record.is_valid
+    return np.hstack([record.u, valid.astype(np.float64), np.where(valid, record.y, 0.0)])
 
 
 def signals(record: Record) -> str:

@@ -62,3 +62,13 @@ def test_limits_of_the_sensor_go_with_modes_that_hardly_count():
     record = replace(record, limits=(None, 19.0), valid=None)
     bla = lfrtorch.estimate_bla(record, nx=3)
     assert lfrtorch.initialise(bla, record, nz=1, nw=1, nn=3).sizes["nz"] == 1
+
+
+def test_outputs_that_are_not_valid_in_the_validation_part_alone_go_through_a_job():
+    record = measured(500, "mine")
+    valid = np.ones(500, dtype=bool)
+    valid[330:335] = False
+    record = replace(record, valid=valid, start="zero")
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=4)
+    settings = lfrtorch.Settings(nx=1, nz=1, nw=1, nn=3, starts=1, trainer=trainer, refit=True)
+    assert lfrtorch.identify(record, settings).refit is not None

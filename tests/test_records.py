@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from lfrtorch.fitting.first_fit import part_of
+from lfrtorch.fitting.refit import all_records
+from lfrtorch.fitting.windows import windows, windows_from_outputs
 from lfrtorch.records import (
     Channel,
     Record,
@@ -383,3 +386,104 @@ def test_a_start_is_estimated_from_valid_outputs():
 def test_a_prediction_needs_all_outputs():
     with pytest.raises(ValueError, match=r"2 output sample\(s\) that are not valid; a prediction"):
         with_past_outputs(with_gap())
+
+
+# --- records of other samples ---------------------------------------------------------------
+
+SAMPLES, LATE = 37, 20
+
+
+def with_every_field(**others) -> Record:
+    """A record whose fields all have a value, or cannot have one beside those; u counts."""
+    rng = np.random.default_rng(0)
+    k = np.arange(float(SAMPLES))
+    valid = np.ones((SAMPLES, 2), dtype=bool)
+    valid[LATE + 5 : LATE + 7, 1] = False
+    given = {
+        "u": k,
+        "y": rng.standard_normal((SAMPLES, 2)),
+        "fs": 2.0,
+        "start": "estimated",
+        "skip": 3,
+        "name": "lab",
+        "source": "simulated",
+        "inputs": (Channel("force", "N"),),
+        "outputs": (Channel("x", "m"), Channel("v", "m/s")),
+        "period": None,  # a part need not hold one
+        "x0": None,  # of start="given"
+        "weight": np.array([1.0, 4.0]),
+        "line_weight": None,  # of start="periodic"
+        "limits": (-9.0, 9.0),
+        "reference": k + 100.0,
+        "valid": valid,
+    }
+    assert set(given) == {field.name for field in dataclasses.fields(Record)}
+    return Record(**given | others)
+
+
+def of_samples(record: Record) -> dict[str, np.ndarray]:
+    """What a record has for each sample: all fields of that length."""
+    found = {name: value for name, value in vars(record).items() if np.shape(value)[:1]}
+    sampled = {name: value for name, value in found.items() if len(value) == record.samples}
+    return sampled | {"valid": record.is_valid}
+
+
+def of_a_join(record: Record) -> list[Record]:
+    """The record again, of a training part, of which all is valid, and a later one."""
+    (joined,) = all_records([record[:LATE]], [dataclasses.replace(record, skip=LATE)])
+    assert joined.samples == SAMPLES
+    return [joined]
+
+
+def of_a_join_at_a_hole(record: Record) -> list[Record]:
+    """Of two parts that meet where the output is not valid."""
+    meet = LATE + 6
+    train = dataclasses.replace(record[:meet], start="estimated")
+    (joined,) = all_records([train], [dataclasses.replace(record, skip=meet)])
+    return [joined]
+
+
+PARTS = {
+    "cut": lambda record: [record[4:30], record[LATE:]],
+    "join": of_a_join,
+    "join at a hole": of_a_join_at_a_hole,
+    "windows": lambda record: windows([record], 10, nx=1),
+    "windows of validation": lambda record: windows([record], 10, nx=1, fitted=False),
+    "windows from outputs": lambda record: windows_from_outputs(
+        dataclasses.replace(record, start="measured", valid=None), 10, 5, None
+    ),
+    "beginning": lambda record: part_of([record], 0.8),
+    "start given": lambda record: [without_coordinates(record)],
+}
+
+
+@pytest.mark.parametrize("kind", PARTS)
+def test_what_a_record_has_for_each_sample_goes_with_the_samples(kind: str):
+    record = with_every_field()
+    expected = of_samples(record)
+    assert set(expected) == {"u", "y", "reference", "valid"}
+    found = PARTS[kind](record)
+    assert found
+    for part in found:
+        at = part.u[:, 0].astype(int)
+        own = of_samples(part)
+        assert set(own) == set(expected), "a field is lost"
+        for name, signal in own.items():
+            if name == "valid" and "outputs" in kind:
+                continue  # all are
+            there = part.is_valid if name == "y" else ...
+            np.testing.assert_array_equal(signal[there], expected[name][at][there], err_msg=name)
+        for name in ("fs", "name", "source", "inputs", "outputs"):
+            assert getattr(part, name) == getattr(record, name)
+        np.testing.assert_array_equal(part.limits, record.limits)
+
+
+def test_other_signals_of_a_record_are_named_each():
+    record = with_every_field()
+    signals = record.signals_in(slice(None))
+    kept = {name: getattr(record, name) for name in ("limits", "start", "skip", "period")}
+    assert record.with_signals(**signals, **kept).samples == SAMPLES
+    for name in signals | kept:
+        others = {field: value for field, value in (signals | kept).items() if field != name}
+        with pytest.raises(TypeError, match=f"'{name}'"):
+            record.with_signals(**others)

@@ -166,17 +166,14 @@ def _measured(path: Path, name: str, called: str) -> Record:
     end = min(int(np.max(np.nonzero(signal)[0], initial=-1)) + 1 for signal in signals.T)
     if not _SKIP < end < record.samples:
         return record
-    return replace(record, u=record.u[:end], y=record.y[:end])
+    return record.part(slice(end), start=record.start, skip=record.skip, period=None)
 
 
 def _fitted(record: Record) -> Record:
     """For training: of a multisine one period, the mean of those without transient."""
     if record.period is None:
         return record
-    u, y = (
-        signal.reshape(_PERIODS, _PERIOD, -1)[1:].mean(axis=0) for signal in (record.u, record.y)
-    )
-    return replace(record, u=u, y=y, start="periodic", skip=0, weight=float(_PERIODS - 1))
+    return replace(record[_PERIOD:], start="periodic").mean_period()
 
 
 def _check(train: Sequence[str], validation: Sequence[str]) -> None:

@@ -15,8 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -79,8 +77,11 @@ def distil(
         y = result.model.simulate(u, start=start)
         if np.isfinite(y).all():
             start = "periodic" if record.start == "periodic" else "estimated"
-            made: dict[str, Any] = {"u": u, "y": y, "start": start, "reference": None}
-            copies.append(replace(record, **made, skip=0, x0=None, limits=None, period=None))
+            made = record.with_signals(
+                u=u, y=y, reference=None, valid=None, limits=None, start=start, skip=0,
+                period=None, x0=None,
+            )  # fmt: skip
+            copies.append(made)
     records = [*train, *copies]
     return fit(
         deepcopy(result.members[0]),

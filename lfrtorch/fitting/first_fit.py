@@ -86,4 +86,4 @@ def part_of(records: Sequence[Record], part: float) -> list[Record]:
 def _beginning(record: Record, part: float) -> Record:
     """What is skipped, and a part of the other samples."""
     end = record.skip + math.ceil(part * (record.samples - record.skip))
-    return replace(record, **record.signals_in(slice(end)), period=None)
+    return record.part(slice(end), start=record.start, skip=record.skip, period=None)

@@ -108,7 +108,7 @@ def _begun(record: Record, first: int, last: int) -> Record | None:
 
 def _masked(record: Record, first: int, last: int) -> Record | None:
     """Return the record without some of its measurements; None if none is left."""
-    valid = np.ones_like(record.y, dtype=bool) if record.valid is None else record.valid.copy()
+    valid = record.is_valid.copy()
     valid[first:last] = False
     if not valid[record.skip :].any(axis=0).all():
         return None

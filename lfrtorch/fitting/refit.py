@@ -25,7 +25,7 @@ from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.fitting.trainer import FitResult, Monitor, Stop, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.ridge import Ridge
-from lfrtorch.records import Record, as_records
+from lfrtorch.records import Record, as_records, measured_signals
 
 
 @typed()
@@ -112,12 +112,7 @@ def all_records(train: Sequence[Record], held_out: Sequence[Record]) -> list[Rec
         if at is None:
             found.append(record)
             continue
-        before, after = found[at], record.signals_in(slice(record.skip, None))
-        both = {
-            name: None if signal is None else np.concatenate([getattr(before, name), signal])
-            for name, signal in after.items()
-        }
-        found[at] = replace(before, **both)
+        found[at] = found[at].joined(record)
     return found
 
 
@@ -127,6 +122,5 @@ def _continues(record: Record, other: Record) -> bool:
     if not count or "periodic" in (record.start, other.start):
         return False
     window = slice(record.skip - count, record.skip)
-    pairs = (record.u[window], other.u[-count:]), (record.y[window], other.y[-count:])
-    # Records at rest may be equal by chance.
-    return all(np.array_equal(*pair) for pair in pairs) and bool(np.ptp(record.y[window]))
+    same = np.array_equal(measured_signals(record)[window], measured_signals(other)[-count:])
+    return same and bool(np.ptp(record.y[window]))  # records at rest may be equal by chance

@@ -104,8 +104,8 @@ def windows_from_outputs(
     last = max(record.samples - 1 - horizon, 0)
     begins = np.linspace(0, last, 1 + math.ceil(last / apart)).round().astype(int)
     weight = np.asarray(record.weight) * (record.samples - 1) / (len(begins) * horizon)
-    whole = replace(record, period=None, weight=weight, skip=0)
-    found = [replace(whole, **record.signals_in(slice(b, b + horizon + 1)), skip=1) for b in begins]
+    cuts = [slice(b, b + horizon + 1) for b in begins]
+    found = [record.part(c, start=record.start, skip=1, period=None, weight=weight) for c in cuts]
     if y_scale is None:
         return found
     scale = _held(record, horizon)
@@ -130,12 +130,17 @@ def _windows(record: Record, horizon: int, before: int) -> list[Record]:
     scored = record.samples - record.skip
     count = math.ceil(scored / horizon)
     weight = np.asarray(record.weight) * scored / (count * horizon)
-    whole = replace(record, period=None, weight=weight)
-    amid = replace(whole, start="estimated", x0=None, skip=before)
     found = []
     for b in record.skip + np.linspace(0, scored - horizon, count).round().astype(int):
         if record.start != "periodic" and b <= max(before, record.skip):
-            found.append(replace(whole, **record.signals_in(slice(b + horizon)), skip=b))
+            first = record.part(
+                slice(b + horizon), start=record.start, skip=b, period=None, weight=weight
+            )
+            found.append(first)
         else:  # in steady state what is before the first sample are the last ones
-            found.append(replace(amid, **record.signals_in(np.arange(b - before, b + horizon))))
+            cut = np.arange(b - before, b + horizon)
+            amid = record.part(
+                cut, start="estimated", x0=None, skip=before, period=None, weight=weight
+            )
+            found.append(amid)
     return found

@@ -40,7 +40,7 @@ from lfrtorch.paired_blocks import (
     no_progress,
     squares_in_blocks,
 )
-from lfrtorch.records import Record, Scaler, as_records, without_coordinates
+from lfrtorch.records import Record, Scaler, as_records, measured_signals, without_coordinates
 from lfrtorch.score_window import with_window
 
 _FOLDS = 5
@@ -359,9 +359,8 @@ def _united(train: list[Record], judges: list[Record]) -> list[Record]:
     for judge in map(without_coordinates, judges):
         for i, record in enumerate(found):
             T = record.samples
-            if judge.skip >= T and all(
-                np.array_equal(a[:T], b) for a, b in ((judge.u, record.u), (judge.y, record.y))
-            ):
+            begins = measured_signals(judge)[:T]
+            if judge.skip >= T and np.array_equal(begins, measured_signals(record)):
                 found[i] = replace(judge, skip=record.skip)
                 break
         else:

@@ -77,8 +77,9 @@ def _steady_part(record: Record) -> Record | None:
     P = (scored - settling) // N
     if (1 if record.skip >= N else 2) > P or settling > scored / 3:
         return None
-    part = record.signals_in(slice(record.samples - P * N, None))
-    y, repeated = part["y"], part["u"] if record.reference is None else part["reference"]
+    cut = slice(record.samples - P * N, None)
+    part = record.part(cut, start="periodic", skip=0, period=N)
+    y, repeated = part.y, part.u if part.reference is None else part.reference
     periods = repeated.reshape(P, N, -1)
     changes = (periods - periods.mean(axis=0)).std(axis=(0, 1))
     drift = y.reshape(P, N, -1).mean(axis=1).std(axis=0)
@@ -86,7 +87,7 @@ def _steady_part(record: Record) -> Record | None:
         drift > _REPEATS * y.std(axis=0)
     ).any():
         return None
-    return replace(record, **part, start="periodic", skip=0)
+    return part
 
 
 def check_spectral_data(data: SpectralData, nx: int, direct: int = 0) -> None:
