@@ -132,6 +132,9 @@ def _windows(record: Record, horizon: int, before: int) -> list[Record]:
     weight = np.asarray(record.weight) * scored / (count * horizon)
     found = []
     for b in record.skip + np.linspace(0, scored - horizon, count).round().astype(int):
+        needed = np.split(record.is_valid[max(b - before, 0) : b + horizon], [min(before, b)])
+        if not all(part.any(axis=0).all() for part in needed if len(part)):
+            continue  # a hole, where an output tells nothing of the window or of its start
         if record.start != "periodic" and b <= max(before, record.skip):
             first = record.part(
                 slice(b + horizon), start=record.start, skip=b, period=None, weight=weight
@@ -143,4 +146,9 @@ def _windows(record: Record, horizon: int, before: int) -> list[Record]:
                 cut, start="estimated", x0=None, skip=before, period=None, weight=weight
             )
             found.append(amid)
+    if not found:
+        raise InputError(
+            f"record '{record.name}' has no window of {horizon} samples with a valid one of each "
+            "output; give a longer horizon, or horizon=None."
+        )
     return found

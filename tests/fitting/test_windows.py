@@ -162,3 +162,21 @@ def test_the_job_takes_a_horizon(model: Model):
     run = lfrtorch.identify(dataset, settings, observer=lfrtorch.Observer())
     assert run.settings.horizon == 30
     assert run.refit is not None
+
+
+@pytest.mark.parametrize("fitted", [True, False])
+def test_windows_leave_out_holes_that_are_longer(fitted: bool):
+    valid = np.ones((300, 2), dtype=bool)
+    valid[100:170, 1] = False
+    record = Record(np.arange(300.0), np.ones((300, 2)), start="estimated", valid=valid)
+    found = windows([record], 25, nx=1, fitted=fitted)
+    assert all(window.scored.any(axis=0).all() for window in found)
+    scored = np.concatenate([window.u[window.skip :, 0] for window in found])
+    assert {*range(100), *range(200, 300)} <= {*scored}
+
+
+def test_records_of_which_no_window_has_all_outputs_are_refused():
+    y = np.ones((100, 2))
+    valid = np.stack([np.arange(100) < 45, np.arange(100) > 55], axis=1)
+    with pytest.raises(InputError, match=r"no window of 10 samples .* horizon"):
+        windows([Record(np.arange(100.0), y, valid=valid)], 10, nx=1)
