@@ -64,6 +64,15 @@ def test_limits_of_the_sensor_go_with_modes_that_hardly_count():
     assert lfrtorch.initialise(bla, record, nz=1, nw=1, nn=3).sizes["nz"] == 1
 
 
+def test_periods_with_outputs_that_are_not_valid_are_fitted_as_signals():
+    rng = np.random.default_rng(0)
+    u = np.tile(rng.standard_normal(100), 4)
+    y, valid = lfilter([0.0, 1.0], [1.0, -0.7], u), np.ones(400, dtype=bool)
+    valid[250:255] = False
+    record = Record(u, np.where(valid, y, np.nan), period=100, skip=100, valid=valid)
+    assert lfrtorch.estimate_bla(record, nx=1).poles == pytest.approx([0.7], abs=1e-6)
+
+
 def test_outputs_that_are_not_valid_in_the_validation_part_alone_go_through_a_job():
     record = measured(500, "mine")
     valid = np.ones(500, dtype=bool)

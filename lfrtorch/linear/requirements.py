@@ -78,6 +78,8 @@ def _steady_part(record: Record) -> Record | None:
     if (1 if record.skip >= N else 2) > P or settling > scored / 3:
         return None
     cut = slice(record.samples - P * N, None)
+    if not record.is_valid[cut].all():
+        return None
     part = record.part(cut, start="periodic", skip=0, period=N)
     y, repeated = part.y, part.u if part.reference is None else part.reference
     periods = repeated.reshape(P, N, -1)
