@@ -30,8 +30,10 @@ from lfrtorch.linear.integrators import (
     integrated,
     integrators_of,
     placed,
+    scored,
     simulation_errors,
     whitening_pole,
+    without_limits,
 )
 from lfrtorch.linear.minima import (
     Problem,
@@ -323,12 +325,12 @@ def _stable(
     if found.constant is not None:
         model = replace(model, y_offset=model.y_offset + scaler.y_scale * found.constant)
     if records and refine != "prediction":
-        errors = np.concatenate([(r.y - model.simulate(r))[r.skip :] for r in records])
+        errors = np.concatenate([r.errors(model.simulate(r)) for r in records])
         if offset and found.constant is None:  # the fit to spectra has eliminated it
             model = replace(model, y_offset=model.y_offset + errors.mean(axis=0))
             errors = errors - errors.mean(axis=0)
         if refine == "simulation":
-            rmse = float(rms(errors / scaler.y_scale))
+            rmse = float(rms((errors / scaler.y_scale)[scored(records)]))
     fit = LinearFit(
         refine, rmse, found.iterations, found.reason, 0.0,
         tuple(map(float, estimate.singular_values)), tuple(notes),
@@ -344,7 +346,8 @@ def _integrating(
     nu, integrators, added = len(about.inputs), max(counts), sum(counts)
     integrates, refine = np.array(counts) > 0, settings.refine
     mixed = not integrates.all()
-    order, records = nx - added, [] if isinstance(data, FRF) else data
+    given = [] if isinstance(data, FRF) else data
+    order, records = nx - added, [without_limits(record, integrates) for record in given]
     if order < (refine == "frequency"):
         more = ", and a fit to a response takes one more" if refine == "frequency" else ""
         raise InputError(
@@ -370,15 +373,19 @@ def _integrating(
             known = [w for w in ("total", "noise") if getattr(data, f"var_{w}") is not None]
             own = own._replace(weight=known[0] if known else None)
     elif refine == "frequency":
-        response = estimate_frf(differenced(data, integrators))
+        response = estimate_frf(differenced(records, integrators))
 
     def found(
-        differences: int, own: Settings, pole: float = 0.0, near: LinearModel | None = None
+        differences: int,
+        own: Settings,
+        pole: float = 0.0,
+        near: LinearModel | None = None,
+        whole: LinearModel | None = None,
     ) -> tuple[LinearModel, list[Record]]:
         if response is not None:
             return _stable(response, order, own, nu * differences, near), []
         some = integrates if mixed else None
-        parts = differenced(records, integrators, differences, pole, some)
+        parts = differenced(records, integrators, differences, pole, some, whole)
         if not order:
             return gain(parts, offset=own.offset), parts
         return _stable(parts, order, own, len(parts[0].inputs) - nu, near), parts
@@ -403,7 +410,7 @@ def _integrating(
         # An error that is almost white, or as coloured as in the last round, needs no other filter.
         if pole < 0.3 or 1.0 - pole > 0.7 * (1.0 - before):
             break
-        model, parts = found(differences, own, pole, model)
+        model, parts = found(differences, own, pole, model, whole)
     model = min(models, key=lambda each: _fit(each).rmse)
     notes = tuple(f"of the differenced output: {note}" for note in _fit(model).notes)
     return replace(model, fit=replace(_fit(model), criterion=refine, notes=notes))

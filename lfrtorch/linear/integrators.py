@@ -34,7 +34,7 @@ from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearFit, LinearModel, linear_cell
 from lfrtorch.metrics import rms
 from lfrtorch.model import simulate_record
-from lfrtorch.records import Channel, NormalisedRecord, Record, Scaler
+from lfrtorch.records import Channel, NormalisedRecord, Record, Scaler, interpolated
 
 _SAME_LINE = 1e-9
 """Distance from z = 1 below which a line is the one at 0, where the response is infinite."""
@@ -56,16 +56,33 @@ def integrators_of(integrators: int | Sequence[int], ny: int) -> tuple[int, ...]
     return tuple(map(int, each))
 
 
+def without_limits(record: Record, integrates: Bool[Booleans, " ny"]) -> Record:
+    """Return a record whose outputs that integrate are not valid where they are at a limit.
+
+    How far beyond it they are is not known, so nothing is known of their differences.
+    """
+    if record.limits is None or record.start == "periodic":
+        return record
+    none = np.array([[-np.inf], [np.inf]])
+    return replace(
+        record,
+        valid=record.is_valid & ~(integrates & (record.beyond != 0)),
+        limits=np.where(integrates, none, np.asarray(record.limits)),
+    )
+
+
 def differenced(
     records: Sequence[Record],
     integrators: int,
     differences: int = 0,
     pole: float = 0.0,
     integrates: Bool[Booleans, " ny"] | None = None,
+    whole: LinearModel | None = None,
 ) -> list[Record]:
     """Return the records of G₁: the output differenced n times, and all signals filtered.
 
-    If only some outputs integrate, the others stay as they are.
+    If only some outputs integrate, the others stay as they are. A difference is valid if all its
+    samples are; what a filter holds after a hole is known best from a model of the ``whole``.
 
     ``differences`` of u follow it as inputs, and what the start of a filter of pole λ adds.
     """
@@ -75,11 +92,23 @@ def differenced(
         if record.start == "periodic":
             for _ in range(integrators):
                 v = np.roll(v, -1, axis=0) - v
-            found.append(replace(record, y=v, limits=None))
+            periods = record.with_signals(
+                u=u, y=v, reference=r, valid=None, limits=None, start="periodic",
+                skip=record.skip, period=record.period,
+            )  # fmt: skip
+            found.append(periods)
             continue
+        there = record.is_valid
+        if whole is not None and record.valid is not None:
+            y = whole.simulate(replace(record, skip=0))
+            v = y + interpolated(v - y, there)
         u = np.hstack([np.diff(u, times, axis=0)[:T] for times in range(differences + 1)])
         changes, skip = np.diff(v, integrators, axis=0), min(record.skip, T - 1)
-        v = changes if integrates is None else np.where(integrates, changes, v[:T])
+        valid = np.logical_and.reduce([there[k : T + k] for k in range(integrators + 1)])
+        if integrates is not None:
+            changes = np.where(integrates, changes, v[:T])
+            valid = np.where(integrates, valid, there[:T])
+        v = changes
         if pole:
             u, v = (_filtered(signal, integrators, pole) for signal in (u, v))
             starts = np.zeros((T, len(records), integrators))
@@ -87,9 +116,9 @@ def differenced(
             u = np.hstack([u, starts.reshape(T, -1)])
         more = tuple(Channel(f"added {j}") for j in range(u.shape[1] - len(record.inputs)))
         r = None if r is None or more else r[:T]
-        differenced = replace(
-            record, u=u, y=v, reference=r, skip=skip, start="estimated",
-            inputs=record.inputs + more, period=None, limits=None,
+        differenced = record.with_signals(
+            u=u, y=v, reference=r, valid=valid, limits=record.limits, start="estimated",
+            skip=skip, period=None, inputs=record.inputs + more,
         )  # fmt: skip
         found.append(differenced)
     return found
@@ -167,30 +196,37 @@ def gain(records: Sequence[Record], *, offset: bool) -> LinearModel:
     parts = [(scaler.normalise(r), r.skip) for r in records]
     u = np.concatenate([n.u[skip:] for n, skip in parts])
     y = np.concatenate([n.y[skip:] for n, skip in parts])
-    rows = np.hstack([u, np.full((len(u), 1), float(offset))])
-    solved = np.asarray(np.linalg.lstsq(rows, y, rcond=None)[0], dtype=np.float64)
-    nu, ny = u.shape[1], y.shape[1]
+    rows, valid = np.hstack([u, np.full((len(u), 1), float(offset))]), scored(records)
+    each = [np.linalg.lstsq(rows[s], y[s, i], rcond=None)[0] for i, s in enumerate(valid.T)]
+    solved, nu = np.column_stack(each), u.shape[1]
     return LinearModel(
         np.zeros((0, 0)),
         np.zeros((0, nu)),
-        np.zeros((ny, 0)),
+        np.zeros((y.shape[1], 0)),
         scaler.y_scale[:, None] * solved[:nu].T / scaler.u_scale,
         first.fs,
         scaler.u_offset,
         scaler.restore_y(solved[nu]),
         first.inputs,
         first.outputs,
-        fit=LinearFit("simulation", float(rms(y - rows @ solved)), 0, "linear least squares", 0.0),
+        fit=LinearFit(
+            "simulation", float(rms((y - rows @ solved)[valid])), 0, "linear least squares", 0.0
+        ),
     )
 
 
+def scored(records: Sequence[Record]) -> Booleans:
+    """Which outputs of all records count, after the skipped samples."""
+    return np.concatenate([record.scored[record.skip :] for record in records])
+
+
 def simulation_errors(model: LinearModel, record: Record) -> Array:
-    """Errors (T - skip, ny) of what counts; an estimated start is that of all samples."""
+    """Errors (T - skip, ny), 0 where none counts; an estimated start is that of all samples."""
     if model.nx:
         y = model.simulate(replace(record, skip=0))
     else:
         y = model.y_offset + (record.u - model.u_offset) @ model.D.T
-    return (record.y - y)[record.skip :]
+    return record.errors(y)
 
 
 def integrated(
@@ -263,7 +299,8 @@ def placed(
     model = replace(model, y_offset=np.where(integrates, scaler.y_offset, model.y_offset))
     at_rest = [record for record in records if record.start == "zero"]
     if offset and at_rest:  # an estimated start state has the output's offset in it
-        error = np.concatenate([simulation_errors(model, r) for r in at_rest]).mean(axis=0)
+        errors = np.concatenate([simulation_errors(model, r) for r in at_rest])
+        error = errors.sum(axis=0) / scored(at_rest).sum(axis=0)
         model = replace(model, y_offset=model.y_offset + error)
     lfr = LFR(linear_cell(model.A, model.B, model.C, model.D))
     states = []
@@ -280,5 +317,5 @@ def placed(
     assert fit is not None
     if fit.criterion == "simulation":
         errors = np.concatenate([simulation_errors(model, r) for r in records])
-        fit = replace(fit, rmse=float(rms(errors / scaler.y_scale)))
+        fit = replace(fit, rmse=float(rms((errors / scaler.y_scale)[scored(records)])))
     return replace(model, fit=fit)

@@ -73,6 +73,47 @@ def carriage(*, load: float = 0.0, noise: float = 0.0, **more: Any) -> Record:
     return Record(u + load, y + noise * rng.standard_normal(y.shape), FS, **more)
 
 
+HOLES = np.ones(T, dtype=bool)
+HOLES[[5, 6, *range(100, 120), 250, T - 1]] = False
+
+
+def with_holes(data: Record) -> Record:
+    """A record whose outputs say nothing of it in holes."""
+    return replace(data, y=np.where(HOLES[:, None], data.y, np.nan), valid=HOLES)
+
+
+def clipped(data: Record) -> Record:
+    """A record whose first output shows a half of its travel."""
+    limits = np.full((2, data.y.shape[1]), [[-np.inf], [np.inf]])
+    limits[:, 0] = np.quantile(data.y[:, 0], [0.25, 0.75])
+    return replace(data, y=np.clip(data.y, *limits), limits=limits)
+
+
+@pytest.mark.parametrize("lost", [with_holes, clipped])
+@pytest.mark.parametrize("start", ["zero", "estimated"])
+@pytest.mark.parametrize(("integrators", "nx"), [(1, 1), (1, 2), (2, 3)])
+def test_a_system_that_integrates_is_recovered_from_the_outputs_that_are_known(
+    lost, start, integrators: Literal[1, 2], nx: int
+):
+    data = record(integrators, start=start, load=0.5)
+    if nx == 1:  # an integrator alone
+        data = replace(data, y=lfilter([0.0, 0.1], [1.0, -1.0], data.u - 0.5, axis=0))
+    model = estimate_bla(lost(data), nx, integrators=integrators)
+    expected = response(integrators) if nx > 1 else 0.1 / (np.exp(1j * OMEGA) - 1)
+    assert error(model, expected) < EXACT
+    np.testing.assert_allclose(model.simulate(data), data.y, atol=1e-6)
+    assert model.fit is not None
+    assert model.fit.rmse < EXACT
+
+
+@pytest.mark.parametrize("lost", [with_holes, clipped])
+def test_a_position_that_is_not_always_known_integrates_beside_its_speed(lost):
+    data = carriage()
+    model = estimate_bla(lost(data), 2, integrators=[1, 0])
+    assert np.sum(model.poles == 1.0) == 1
+    np.testing.assert_allclose(model.simulate(data), data.y, atol=1e-6)
+
+
 @pytest.mark.parametrize("start", ["zero", "estimated"])
 @pytest.mark.parametrize("load", [0.0, 2.0])
 def test_a_position_integrates_beside_its_speed(start, load: float):
