@@ -247,9 +247,8 @@ def _compiled(
         doubles, parts = [np.asarray(signal, np.float64) for signal in out], min(R, workers())
         weights = [*given, *model.arguments(), *model.kernel()]
         spread(simulate_known_records, parts, parts, *weights, met_within, *doubles)
-        for signal, found in zip(out, doubles, strict=True):
-            if found is not signal:
-                signal[:] = found
+        for signal, found in zip(near, doubles, strict=True):
+            signal.copy_(torch.from_numpy(found))  # silent beyond the range of float32
         return near
     spread(simulate_record, R, to_numpy(u), *kernel_arguments(simulated), met_within, *out)
     return near if simulated is cell else signals(cell, u, near.x)

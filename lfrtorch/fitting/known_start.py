@@ -239,11 +239,14 @@ def known_starts(stage: Stage, linear: LinearModel) -> tuple[Settings, list[Mode
             f"known model: {values}; error {quantity(error, common_unit(model.outputs))} in "
             f"training, {quantity(result.seconds, 's')}"
         )
-    model.lfr.to(device=settings.device, dtype=settings.dtype)
     if grey:
-        return replace(settings, starts=1, ridge=0.0), [model]
-    settings = replace(settings, starts=count)
-    return settings, [with_learned(model, records, settings, n) for n in settings.seeds]
+        settings, models = replace(settings, starts=1, ridge=0.0), [model]
+    else:
+        settings = replace(settings, starts=count)
+        models = [with_learned(model, records, settings, n) for n in settings.seeds]
+    for model in models:
+        model.lfr.to(device=settings.device, dtype=settings.dtype)
+    return settings, models
 
 
 def physical(model: Model) -> dict[str, float]:

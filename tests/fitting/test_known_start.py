@@ -149,11 +149,12 @@ def test_a_checkpoint_holds_the_equations(settings: dict[str, Any], tmp_path: Pa
         {"nx": 1, "nz": 2, "nw": 1, "static": "polynomial", "degree": 2},
         {"nz": 1, "nw": 1, "nn": 3, "trainer": lfrtorch.Adam(max_iter=3)},
         {"nn": 0, "dtype": torch.float32},
+        {"nx": 1, "nz": 1, "nw": 1, "nn": 3, "dtype": torch.float32},
         {"known": Known(swing, states=["angle", "speed"]), "nz": 1, "nw": 1, "nn": 3},
         {"known": known(method="euler", substeps=5), "nn": 0},
         {"known": known(intersample="bl"), "nn": 0},
     ],
-    ids=["windows", "polynomial", "adam", "float32", "no parameters", "euler", "bl"],
+    ids=["windows", "polynomial", "adam", "float32", "learned", "no parameters", "euler", "bl"],
 )
 def test_other_features_work_with_it(settings: dict[str, Any]):
     train = record(drag=0.1)
