@@ -79,8 +79,13 @@ def oscillator() -> Known:
     def rates(x, u, p):
         return x.speed, (u[0] - 10.0 * x.speed - 5e4 * x.position) / 2.0
 
-    states = ["position", "speed"]
-    return Known(rates, states=states, sees=["speed"], intersample="bl")
+    return Known(
+        rates,
+        states=["position", "speed"],
+        outputs=lambda x, u, p: (x.position,),
+        sees=["speed"],
+        intersample="bl",
+    )
 
 
 def learning_curves(realisations: int) -> None:

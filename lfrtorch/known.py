@@ -6,6 +6,7 @@ import math
 from collections import namedtuple
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -100,7 +101,8 @@ class Known:
         f: the rates, or the next states with ``method="discrete"``: a tuple, one for each state.
         states: names, or a :class:`State` each.
         parameters: what a fit finds, by name: a :class:`Parameter`, or a number to start from.
-        outputs: y, a tuple. Default: the first states, one for each output of the data.
+        outputs: y, a tuple. Default: the states that outputs of the data are called after; of as
+            many states as outputs, the others are in their order.
         method: how a sample is made of f: ``"rk4"``, the classical method of Runge and Kutta,
             ``"euler"``, or ``"discrete"``.
         substeps: steps of the method in a sample (in half a one with ``"bl"``).
@@ -182,8 +184,27 @@ class Known:
         name = getattr(self.f, "__name__", type(self.f).__name__)
         return f"Known({name}: {', '.join(self._x._fields)}; {', '.join(self.parameters)})"
 
-    def equations(self, nu: int, ny: int) -> KnownEquations:
-        """The equations as tables of operations, for so many inputs and outputs.
+    def observed(self, outputs: Sequence[str]) -> tuple[str, ...]:
+        """The state that each output of the data is, by name, if ``outputs`` is not given.
+
+        Raises:
+            ValueError: outputs that are not called after states, and not as many as are left.
+        """
+        names = self._x._fields
+        others = [name for name in outputs if name not in names]
+        left = [name for name in names if name not in outputs]
+        if others and len(others) != len(left):
+            raise InputError(
+                f"the known model has {len(names)} state(s), {', '.join(names)}, and the data have "
+                f"{len(outputs)} output(s), {', '.join(outputs)}; call outputs as the states that "
+                "they are, or give outputs=, a function of (x, u, p) that returns a value for each "
+                f"output, for instance lambda x, u, p: (x.{names[0]},)."
+            )
+        found = dict(zip(others, left, strict=False))
+        return tuple(found.get(name, name) for name in outputs)
+
+    def equations(self, nu: int, outputs: Sequence[str]) -> KnownEquations:
+        """The equations as tables of operations, for so many inputs and outputs of these names.
 
         Raises:
             ValueError: functions that have no table, or return other numbers of values.
@@ -211,23 +232,17 @@ class Known:
                 )
             return found
 
-        outputs = self.outputs
-        if outputs is None:
-            if nx < ny:
-                raise InputError(
-                    f"the known model has {nx} state(s) and the data {ny} outputs; give outputs=, "
-                    "a function of (x, u, p) that returns a value for each output."
-                )
-            outputs = _first_states(ny)
-        f, h = traced(self.f, "f", nx), traced(outputs, "outputs", ny)
+        f = traced(self.f, "f", nx)
+        y = self.outputs or partial(_some_states, self.observed(outputs))
+        h = traced(y, "outputs", len(outputs))
         names = tuple(self._x._fields), tuple(self.parameters)
         units = tuple(parameter.unit for parameter in self.parameters.values())
         how = self.method, self.substeps, self.centred
         return KnownEquations(f, h, *names, units, nu, *how)
 
-    def map(self, nu: int, ny: int, fs: float) -> KnownMap:
+    def map(self, nu: int, outputs: Sequence[str], fs: float) -> KnownMap:
         """The equations as a static map of an LFR, of signals in physical units, in float64."""
-        found = KnownMap(self.equations(nu, ny), 1.0 / fs, dtype=torch.float64)
+        found = KnownMap(self.equations(nu, outputs), 1.0 / fs, dtype=torch.float64)
         with torch.no_grad():
             for i, parameter in enumerate(self.parameters.values()):
                 found.p_scale[i] = parameter.size
@@ -245,6 +260,6 @@ def _finite(name: str, value: Any) -> None:
         raise InputError(f"{name} is {value!r}; give a finite number.")
 
 
-def _first_states(count: int) -> Callable[..., Any]:
+def _some_states(names: Sequence[str], x: Any, u: Any, p: Any) -> tuple[Any, ...]:
     """Outputs that are states."""
-    return lambda x, u, p: x[:count]
+    return tuple(getattr(x, name) for name in names)

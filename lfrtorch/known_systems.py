@@ -80,6 +80,7 @@ def emps() -> Known:
     return Known(
         rates,
         states=[State("position", unit="m"), State("speed", unit="m/s")],
+        outputs=lambda x, u, p: (x.position,),
         sees=["speed"],
         acts_on=["speed"],
         parameters={

@@ -46,7 +46,7 @@ def known_model() -> Model:
         rates, states=["h1", "h2"], parameters={"out": 0.4, "edge": 0.7}, outputs=outputs,
         substeps=2, intersample="bl",
     )  # fmt: skip
-    own = known.map(2, 3, 4.0)
+    own = known.map(2, ["y1", "y2", "y3"], 4.0)
     network = Network(2, 1, 4, "softplus", dtype=torch.float64)
     static = DirectSum([own, network], [(own.nz, own.nw), (2, 1)])
     cell = LFRCell(2, 3, 3, own.nz + 2, own.nw + 1, static, dtype=torch.float64, random=False)

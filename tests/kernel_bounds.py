@@ -58,7 +58,7 @@ def model(draw: random.Random) -> lfrtorch.Model:
     )
     nz, nw = (nz, nw) if static else (0, 0)
     if isinstance(static, lfrtorch.Network) and dtype == torch.float64 and draw.random() < 0.5:
-        own = known(draw, ny).map(nu, ny, 1.0)
+        own = known(draw, ny).map(nu, ["y"] * ny, 1.0)
         static = DirectSum([own, static], [(own.nz, own.nw), (nz, nw)])
         nx, nz, nw = max(nx, 2), own.nz + nz, own.nw + nw
     cell = LFRCell(nu, ny, nx, nz, nw, static, dtype=dtype, random=False)

@@ -59,7 +59,7 @@ def known_model(known: Known, linear: LinearModel, records: Sequence[Record]) ->
         linear.y_offset,
         rms_scale([r.y for r in records], linear.y_offset),
     )
-    static = known.map(nu, ny, first.fs)
+    static = known.map(nu, [channel.name for channel in first.outputs], first.fs)
     with torch.no_grad():
         for ends, place, offset, scale in (
             (static.of_z, nx, scaler.u_offset, scaler.u_scale),
@@ -203,6 +203,9 @@ def known_starts(stage: Stage, linear: LinearModel) -> tuple[Settings, list[Mode
         settings = replace(settings, known=known)
     records = in_windows(stage)
     model = known_model(known, linear, records)
+    if known.outputs is None and len(model.outputs) > 1:
+        pairs = zip(model.outputs, known.observed([y.name for y in model.outputs]), strict=True)
+        observer.say(f"known model: {', '.join(f'{y.name} is {state}' for y, state in pairs)}")
     grey = settings.nn == 0 and not settings.nx and settings.static == "network"
     count = _STARTS if settings.starts == "auto" else settings.starts
     if known.parameters:

@@ -128,7 +128,7 @@ def test_errors_are_lengths_and_angles() -> None:
 
 def test_the_body_turns_as_rotations_do() -> None:
     """One sample of the equations beside the matrix exponential of the rates."""
-    static = equations().map(4, 12, 100.0)
+    static = equations().map(4, [name for name, _ in nanodrone.OUTPUTS], 100.0)
     z = np.zeros(16)
     z[6:9], z[9:12], z[12:] = [0.3, -0.2, 0.5], [1.0, -2.0, 0.7], 1750.0
     w = static(static.p.new_tensor(z)).detach().numpy()

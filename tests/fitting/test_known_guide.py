@@ -30,7 +30,7 @@ def test_a_model_of_the_guide_is_fitted(text: str):
     settings = names["settings"]
     u = np.repeat(np.random.default_rng(0).standard_normal(30), 6)
     u = 2.0 + 0.5 * u if "tank" in names else u  # a pump does not suck
-    model = names["known"].map(1, 1, 10.0)
+    model = names["known"].map(1, ["y"], 10.0)
     x, y = torch.zeros(model.nx, dtype=torch.float64), []
     for value in torch.from_numpy(u):
         x, output = model(torch.cat([x, value[None]])).detach().split([model.nx, 1])

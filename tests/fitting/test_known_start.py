@@ -27,9 +27,13 @@ def swing(x: Any, u: Any, p: Any) -> Any:
     return x.speed, u[0] - GRAVITY * torch.sin(x.angle)
 
 
+def angle(x: Any, u: Any, p: Any) -> Any:
+    return (x.angle,)
+
+
 def known(**options: Any) -> Known:
     usual: dict[str, Any] = {
-        "states": ["angle", State("speed", unit="rad/s")],
+        "states": ["angle", State("speed", unit="rad/s")], "outputs": angle,
         "parameters": {
             "damping": Parameter(0.1, low=0.0, unit="1/s"), "gravity": Parameter(8.0, unit="1/s²"),
         },
@@ -150,7 +154,12 @@ def test_a_checkpoint_holds_the_equations(settings: dict[str, Any], tmp_path: Pa
         {"nz": 1, "nw": 1, "nn": 3, "trainer": lfrtorch.Adam(max_iter=3)},
         {"nn": 0, "dtype": torch.float32},
         {"nx": 1, "nz": 1, "nw": 1, "nn": 3, "dtype": torch.float32},
-        {"known": Known(swing, states=["angle", "speed"]), "nz": 1, "nw": 1, "nn": 3},
+        {
+            "known": Known(swing, states=["angle", "speed"], outputs=angle),
+            "nz": 1,
+            "nw": 1,
+            "nn": 3,
+        },
         {"known": known(method="euler", substeps=5), "nn": 0},
         {"known": known(intersample="bl"), "nn": 0},
     ],
@@ -221,25 +230,27 @@ def test_starts_vary_within_the_bounds():
         (lambda: known(method="discrete", intersample="bl"), "nothing between samples"),
         (lambda: known(sees=["position"]), "give some of angle, speed, u"),
         (lambda: known(acts_on=[]), "give some of angle, speed, y"),
-        (lambda: known().equations(1, 3), "has 2 state"),
+        (lambda: known(outputs=None).equations(1, ["a", "b", "c"]), "has 2 state"),
         (
-            lambda: Known(lambda x, u, p: (x.a,), states=["a", "b"]).equations(1, 1),
+            lambda: Known(lambda x, u, p: (x.a,), states=["a", "b"]).equations(1, ["y"]),
             "returns 1 values; give 2",
         ),
         (
-            lambda: Known(lambda x, u, p: (u * x.a,), states=["a"]).equations(1, 1),
+            lambda: Known(lambda x, u, p: (u * x.a,), states=["a"]).equations(1, ["y"]),
             r"it uses \(<a number>,\), which is no single number",
         ),
         (
-            lambda: Known(lambda x, u, p: torch.cat([x.a, x.a]), states=["a"]).equations(1, 1),
+            lambda: Known(lambda x, u, p: torch.cat([x.a, x.a]), states=["a"]).equations(1, ["y"]),
             "it calls cat with a list; use single numbers",
         ),
         (
-            lambda: Known(lambda x, u, p: (x.b,), states=["a"]).equations(1, 1),
+            lambda: Known(lambda x, u, p: (x.b,), states=["a"]).equations(1, ["y"]),
             "f of the known model fails: .*has no attribute 'b'",
         ),
         (
-            lambda: Known(lambda x, u, p: (x.a if x.a > 0 else 0,), states=["a"]).equations(1, 1),
+            lambda: Known(lambda x, u, p: (x.a if x.a > 0 else 0,), states=["a"]).equations(
+                1, ["y"]
+            ),
             "it branches in Python on a value; use torch.where",
         ),
     ],
@@ -247,6 +258,43 @@ def test_starts_vary_within_the_bounds():
 def test_what_cannot_be_is_refused(make: Any, message: str):
     with pytest.raises(InputError, match=message):
         make()
+
+
+def driven(*outputs: str, states: tuple[str, ...] = ("current", "speed")) -> list[str]:
+    """The states of a motor that outputs of these names are, as a figure of each tells."""
+    known = Known(lambda x, u, p: [0.0 * u[0]] * len(x), states=[*states], method="discrete")
+    static = known.map(1, outputs, 1.0)
+    z = torch.arange(float(len(states) + 1), dtype=torch.float64)
+    return [states[int(i)] for i in static(z)[len(states) :]]
+
+
+def test_outputs_are_the_states_of_their_names_and_others_those_that_are_left():
+    assert driven("speed") == ["speed"]
+    assert driven("speed", "current") == ["speed", "current"]
+    assert driven("speed", "i") == ["speed", "current"]
+    assert driven("y1", "y2") == ["current", "speed"]
+    assert driven("y", states=("level",)) == ["level"]
+    with pytest.raises(
+        InputError, match=r"2 state\(s\), current, speed, .* 1 output\(s\), y; call"
+    ):
+        driven("y")
+    with pytest.raises(InputError, match="outputs=, a function"):
+        driven("speed", "y", states=("a", "b", "speed"))
+
+
+def test_a_fit_takes_the_state_that_the_output_is_called_after():
+    def lags(x: Any, u: Any, p: Any) -> Any:
+        return 0.5 * x.current + u[0], p.stays * x.speed + 0.1 * x.current
+
+    u, x, y = np.random.default_rng(0).standard_normal(200), np.zeros(2), []
+    for value in u:
+        y.append(x[1])
+        x = np.array([0.5 * x[0] + value, 0.9 * x[1] + 0.1 * x[0]])
+    motor = Known(lags, states=["current", "speed"], parameters={"stays": 0.7}, method="discrete")
+    train = Record(u, np.array(y), outputs=(lfrtorch.Channel("speed"),))
+    run = identified(train, known=motor, nn=0, starts=1)
+    assert run.parameters is not None
+    assert run.parameters.values == pytest.approx([0.9], abs=1e-6)
 
 
 def test_a_parameter_that_does_not_matter_has_no_error():
