@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -228,11 +229,13 @@ class Problem(LeastSquares):
         if sum(counts) < 2 * BATCH or self.ranks.world > 1 or len(self._terms) > 1 + len(ridges):
             return [self]
         generator = torch.Generator().manual_seed(epoch)
-        orders = [torch.randperm(count, generator=generator) for count in counts]
-        found = []
+        order = torch.randperm(sum(counts), generator=generator)  # of all, and dealt out
+        firsts, found = [0, *itertools.accumulate(counts)], []
         for i in range(parts):
-            part = copy(self)
-            part.errors = self.errors.part([order[i::parts] for order in orders])
+            part, drawn = copy(self), order[i::parts]
+            part.errors = self.errors.part(
+                [drawn[(drawn >= a) & (drawn < b)] - a for a, b in itertools.pairwise(firsts)]
+            )
             part._terms = [part.errors, *(ridge.part(parts) for ridge in ridges)]
             part._reduced, part._checked = None, set()
             found.append(part)

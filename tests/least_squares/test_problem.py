@@ -530,6 +530,20 @@ def test_minibatches_are_the_whole_in_parts(model: Model, ridge: float):
     assert_close(problem.gradient(theta)[1], whole)  # the parts have weights of their own
 
 
+def test_minibatches_share_records_of_unlike_lengths(model: Model):
+    """Also if no two are as long, and in the same numbers, give or take one."""
+    for lengths in ([5 + i for i in range(70)], [20] * 64 + [30 + i for i in range(30)]):
+        records = [measure(model, samples, seed=i) for i, samples in enumerate(lengths)]
+        problem = Problem.of(model, records)
+        parts = problem.minibatches(0)
+        counts = [sum(len(group.u) for group in part.errors.groups) for part in parts]
+        assert sum(counts) == len(records)
+        assert max(counts) - min(counts) <= 1
+        whole = problem.gradient(problem.theta + 0.01)[1]
+        of_parts = [part.size * part.gradient(problem.theta + 0.01)[1] for part in parts]
+        torch.testing.assert_close(torch.stack(of_parts).sum(0) / problem.size, whole)
+
+
 def test_minibatches_are_drawn_anew_and_again_the_same(model: Model):
     problem = Problem.of(model, some_records(model) * 20)
     first, again, other = (
