@@ -49,6 +49,11 @@ from lfrtorch.records import Channel, Record, as_records, as_signal
 _TRUNCATION = 1e-8
 """Singular values of J, of columns of unit length, that count as zero relative to the largest."""
 
+_SHIFTED = 0.5
+"""Standard errors, rms over the directions, from which a doubt names a shift of the fit."""
+
+_NEAR = 40.0
+"""Deviations of the noise from a limit, within which it can reach that."""
 
 NOT_AT_MINIMUM = "the fit is not at its minimum"
 """How a note begins that says so."""
@@ -346,7 +351,8 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
         rank=rank,
         noise=deviations * model.scaler.y_scale,
         relative=np.sqrt(variance).mean(axis=0) / np.maximum(y.std(axis=0), 1e-300),
-        doubts=_doubts(every, model, W, sizes, rank, left),
+        doubts=_doubts(every, model, W, sizes, rank, left)
+        + _clipped(every, W, meat, torch.as_tensor(deviations)),
         colour=colour,
         reach=TrainingReach.of(np.concatenate(zs), variance),
     )
@@ -409,7 +415,8 @@ def _noise(
         errors = along.group.weigh(along.errors[None])[0].numpy()
         e = errors if along.group.spectral else innovations(a, errors)
         products.append(e.T @ e)
-        power += np.square(along.errors[along.record.skip :].numpy()).sum(axis=0)
+        counted = along.group.scored if along.group.spectral else along.group.weight != 0
+        power += np.square((along.errors * counted[0]).numpy()).sum(axis=0)
     plain = [i for i, along in enumerate(every) if not along.group.spectral] or range(len(every))
     pooled = _ratio(
         np.sum([products[i] for i in plain], axis=0), np.sum([left[i] for i in plain], axis=0)
@@ -509,6 +516,38 @@ def _doubts(
             "matter, surprise and bands are large."
         )
     return tuple(found)
+
+
+def _clipped(
+    every: Sequence[Gradients],
+    W: Float[Tensor, "K K"],
+    meat: Float[Tensor, "K K"],
+    noise: Float[Tensor, " ny"],
+) -> tuple[str, ...]:
+    """How far noise that the limits of a sensor cut off has shifted the fit, if that is far."""
+    K, total = len(W), W.new_zeros(len(W))
+    for along in every:
+        if along.group.limits is None or not noise.all():
+            continue
+        # The error of a sample whose output is d beyond a limit is e where d + e < 0, and min(d, 0)
+        # elsewhere. Noise e of variance σ² leaves a mean of σ φ(d/σ) + min(d, 0) Φ(d/σ), inwards.
+        mean = torch.zeros_like(along.errors)
+        for sign, limit in zip((-1.0, 1.0), along.group.limits[0], strict=True):
+            d = (sign * (along.trajectory.y[0] - limit) / noise).clamp_min(-_NEAR)
+            density = torch.exp(-0.5 * d.square()) / math.sqrt(2.0 * math.pi)
+            mean += sign * noise * (density + d.clamp_max(0.0) * torch.special.ndtr(d))
+        mean *= torch.as_tensor(along.record.factors).square()
+        for time, rows in along.blocks():
+            total += torch.einsum("tok,to->k", rows[..., :K], mean[time])
+    shift = torch.linalg.pinv(root(meat), rtol=_TRUNCATION) @ (W.mT @ total)
+    errors = float(shift.square().mean().sqrt())
+    if errors < _SHIFTED:
+        return ()
+    return (
+        "noise is not small beside the limits of the sensor: they cut it off on one side, which "
+        f"shifts the fit by some {number(errors, 2)} standard errors, which errors and bands do "
+        "not know; a sensor of more range or less noise helps.",
+    )
 
 
 def _derivative_at_rest(model: Model, u: Float[Array, " nu"]) -> Float[Array, "n P"]:

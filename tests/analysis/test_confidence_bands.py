@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
@@ -263,6 +264,34 @@ def test_noise_of_a_loud_record_is_no_fault_of_a_model_in_a_quiet_one():
     assert not any("depend" in doubt for doubt in found.doubts)
     linear = lfrtorch.estimate_bla([quiet, loud], nx=2).to_model()
     assert any("depend" in doubt for doubt in uncertainty(linear, [quiet, loud]).doubts)
+
+
+def clipped(T: int, level: float) -> tuple[Uncertainty, Array]:
+    """A fit of a regression whose output ends at 1 and -2 deviations, and by how much D is off."""
+    model, record, D = regression(T)
+    s = model.scaler
+    e = level * np.random.default_rng(1).standard_normal((T, 1))
+    y = s.restore_y(s.normalise_u(record.u) @ D.T + e)
+    limits = s.restore_y(np.array([[-12.0], [6.0]]))
+    clipped = replace(record, y=np.clip(y, *limits), limits=limits)
+    found = uncertainty(fitted(model, [clipped], 10), clipped)
+    return found, found.model.lfr.cell.Dyu.detach().numpy()[0] - D[0]
+
+
+@pytest.mark.parametrize("level", [0.02, 1.0])
+def test_noise_is_that_of_the_samples_that_count(level: float):
+    """The model goes on beyond the limits of a sensor, by far more than the noise."""
+    found, _ = clipped(2000, level)
+    assert found.noise == pytest.approx(level * found.model.scaler.y_scale, rel=0.15)
+
+
+def test_noise_that_limits_cut_off_is_doubted_by_how_far_it_shifts_the_fit():
+    found, off = clipped(8000, 1.0)
+    (doubt,) = [each for each in found.doubts if "limits" in each]
+    told = float(re.findall(r"shifts the fit by some ([0-9.]+)", doubt)[0])
+    shift = np.linalg.solve(np.linalg.cholesky(found.covariance), off)
+    assert told == pytest.approx(np.sqrt(np.mean(shift**2)), rel=0.3)
+    assert not any("limits" in each for each in clipped(2000, 0.02)[0].doubts)
 
 
 def test_a_model_off_its_minimum_is_doubted(known: tuple[Model, Uncertainty]):
