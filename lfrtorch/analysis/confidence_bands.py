@@ -35,6 +35,7 @@ from lfrtorch.analysis.linearisation import linear_part, linearise
 from lfrtorch.analysis.noise_model import LEAST, NoiseModel, Spectra, colours, innovations
 from lfrtorch.analysis.output_residuals import LEVEL, ROUNDING, SLIGHT, OutputResiduals
 from lfrtorch.analysis.residual_analysis import SHORTEST, of_simulation
+from lfrtorch.analysis.static_slopes import infinite_slope
 from lfrtorch.analysis.training_reach import TrainingReach
 from lfrtorch.data_reach import FARTHEST
 from lfrtorch.engine.lfr import LFR
@@ -319,7 +320,7 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
                 f"the model diverges on record '{along.record.name}'; give the records that it was "
                 "fitted to."
             )
-    W, seen, left = _directions(every)
+    W, seen, left = _directions(every, model)
     sizes, colour, deviations = _noise(every, W)
     rank, K = int((seen == 1).sum()), len(kept)
     # A direction that the data do not tell has the variance of the least one that they do.
@@ -359,7 +360,7 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
 
 
 def _directions(
-    every: Sequence[Gradients],
+    every: Sequence[Gradients], model: Model
 ) -> tuple[Float[Tensor, "K K"], Float[Tensor, " K"], tuple[float, float]]:
     """W with orthonormal columns of J W, how much of each J sees (1: all), and the way left to go.
 
@@ -376,6 +377,9 @@ def _directions(
             f"the records have {samples} scored numbers and the model {K} parameters that vary; "
             "give the records that it was fitted to, more samples than parameters."
         )
+    if not total.R.isfinite().all():
+        found = infinite_slope(model, [along.record for along in every])
+        raise InputError(f"{found or 'derivatives of the outputs are not finite'}.")
     J, r = total.R[:, :-1], total.R[:, -1]
     scale = torch.linalg.vector_norm(J, dim=0)
     scale[scale == 0] = 1.0

@@ -37,6 +37,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import CUT_SHORT, Reason, told
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
+from lfrtorch.analysis.static_slopes import infinite_slope
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.exclusions import refuse_together
@@ -309,6 +310,10 @@ def _fitted(
     result = ranked[0].result()
     if cut is not None:  # the best start may have come to its end, but not all of those beside it
         result = replace(result, reason=cut.reason, detail=cut.detail)
+    elif result.reason in (Reason.JACOBIAN_VANISHES, Reason.GRADIENT_DIVERGED) and (
+        flaw := infinite_slope(result.model, train)
+    ):
+        result = replace(result, reason=Reason.JACOBIAN_VANISHES, detail=flaw)
     if not alone:
         result = replace(result, starts=judge.summaries(ranked))
     if average > 1:

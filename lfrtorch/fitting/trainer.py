@@ -187,7 +187,7 @@ class FitResult:
             taken before are added.
         seconds_per_iteration: median over the accepted iterations but the first, which may compile.
         reason: why the search ended, a :class:`lfrtorch.Reason`.
-        detail: what else is known of a process that was lost.
+        detail: what else is known of a process that was lost, or a slope that is not finite.
         starts: all starts if there were several, the best first.
         averaged: number of starts that the model is the mean of; history and iterate are those
             of the best one.

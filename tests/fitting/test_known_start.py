@@ -305,6 +305,24 @@ def test_a_parameter_that_does_not_matter_has_no_error():
     assert any("tell 0 of 1 directions" in note for note in run.parameters.notes)
 
 
+def test_a_slope_that_is_not_finite_is_told_with_its_place():
+    """A tank that is empty at first: the root has a value there, and no derivative."""
+    u, h, y = np.abs(np.random.default_rng(0).standard_normal(100)), 0.0, []
+    for value in u:
+        y.append(h)
+        h = max(h + 0.3 * value - 0.4 * np.sqrt(h), 0.0)
+    tank = Known(
+        lambda x, u, p: (x.h + 0.3 * u[0] - p.out * torch.sqrt(torch.relu(x.h)),),
+        states=["h"], parameters={"out": 0.3}, method="discrete",
+    )  # fmt: skip
+    run = identified(Record(u, np.array(y), name="filling"), known=tank, starts=1, nn=0)
+    told = "the next h is not finite in sample 0 of record 'filling', by h, which is 0; a root"
+    assert run.fit.reason == lfrtorch.Reason.JACOBIAN_VANISHES
+    assert told in run.fit.outcome
+    assert run.parameters is not None
+    assert told in run.parameters.notes[0]
+
+
 def test_equations_that_run_away_are_refused_with_what_may_help():
     stiff = Known(lambda x, u, p: (u[0] - p.k * x.a,), states=["a"], parameters={"k": 500.0})
     with pytest.raises(InputError, match=r"the known model diverges .*\n.*substeps=10"):

@@ -1,0 +1,42 @@
+"""Where a model has values but no derivatives, so that there is neither a step nor an error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from lfrtorch._support.tables import number
+from lfrtorch.engine.nonlinearity import known_parts, linearise_static, of_static
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+
+@torch.no_grad()
+def infinite_slope(model: Model, records: Sequence[Record]) -> str:
+    """The first slope of the static map that is not finite along the records; "" if all are."""
+    cell = model.lfr.cell
+    weights = of_static(dict(cell.named_parameters()))
+    for record in records:
+        signals = model.signals(record)
+        slopes = linearise_static(cell.static, signals.z, weights)
+        every = torch.cat([slopes.J, slopes.by_weight()], -1)[0]
+        if not signals.w.isfinite().all() or every.isfinite().all():
+            continue
+        k, i, j = (~every.isfinite()).nonzero()[0].tolist()
+        of, by, at = f"w{i + 1}", f"z{j + 1}", signals.z[0, k]
+        value = "" if j >= cell.nz else number(float(at[j]))
+        if (parts := known_parts(cell.static)) is not None and i < parts[0].nw:
+            known = parts[0]
+            states, inputs = known.equations.states, [u.name for u in model.inputs]
+            of = [*(f"the next {name}" for name in states), *(y.name for y in model.outputs)][i]
+            if j < known.nz:
+                by = [*states, *inputs][j]
+                value = number(float(known.of_z[j, 0] + known.of_z[j, 1] * at[j]))
+        by = "a parameter" if j >= cell.nz else f"{by}, which is {value}"
+        return (
+            f"the derivative of {of} is not finite in sample {k} of record '{record.name}', by "
+            f"{by}; a root, a logarithm and a division have none at 0: keep away from it, "
+            "as in torch.sqrt(level.clamp(min=1e-6)), or choose by torch.where"
+        )
+    return ""
