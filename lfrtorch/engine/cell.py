@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -154,12 +154,28 @@ class LFRCell(nn.Module):
         Raises:
             ValueError: signals of other sizes, dtype or device than the weights.
         """
+        if self.autocast:
+            with torch.autocast(self.A.device.type, enabled=False):
+                return self(*self.uncast(u, x))
         axes = u.shape[:-1] if isinstance(u, Tensor) else ()
         self._check("u", u, (*axes, self.nu))
         self._check("x", x, (*axes, self.nx))
         w = self.internal(u, x)[1]
         y = x @ self.Cy.mT + u @ self.Dyu.mT + w @ self.Dyw.mT
         return y, x @ self.A.mT + u @ self.Bu.mT + w @ self.Bw.mT
+
+    @property
+    def autocast(self) -> bool:
+        """Whether ``torch.autocast`` would choose the dtypes; the layer keeps to its weights'."""
+        device = self.A.device.type
+        return device != "meta" and torch.is_autocast_enabled(device)
+
+    def uncast(self, *signals: Any) -> list[Any]:
+        """Signals in the dtype of the weights, if they are in that of ``torch.autocast``."""
+        chosen = torch.get_autocast_dtype(self.A.device.type)
+        own = [isinstance(each, Tensor) and each.dtype == chosen for each in signals]
+        pairs = zip(signals, own, strict=True)
+        return [each.to(self.A.dtype) if cast else each for each, cast in pairs]
 
     def internal(
         self, u: Float[Tensor, "*axes nu"], x: Float[Tensor, "*axes nx"]
@@ -194,7 +210,13 @@ class LFRCell(nn.Module):
             shapes |= {f"static.{name}": shape for name, shape in of_static(nz, nw).items()}
         weights = {**dict(self.named_parameters()), **dict(self.named_buffers())}
         for name, shape in shapes.items():
-            found = tuple(weights[name].shape) if name in weights else ()
+            if name not in weights:
+                raise InputError(
+                    f"{name} is no parameter any more, as of a parametrisation or a pruning; the "
+                    "equations need it as it is. A static map of torch's own layers may have one: "
+                    "static=torch.nn.Sequential(...)."
+                )
+            found = tuple(weights[name].shape)
             if found != shape:
                 raise InputError(
                     f"{name} has the shape {found}; with nu={nu}, ny={ny}, nx={nx}, nz={nz} and "

@@ -91,7 +91,8 @@ class _Adjoint(_Once):
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         signals = Trajectory(x, z, w, e)  # y does not matter
         about = Linearisation(cell, u, signals, periodic=periodic, weights=weights)
-        found = about.adjoint(e, end)
+        with torch.autocast(u.device.type, enabled=False):
+            found = about.adjoint(e, end)
         return found.u, found.x0, found.theta
 
     @staticmethod

@@ -90,7 +90,6 @@ class LFR(nn.Module):
         u: Tensor,
         x0: Tensor | None = None,
         start: Start = "zero",
-        *,
         return_state: bool = False,
     ) -> Tensor | tuple[Tensor, Tensor]:
         """Simulated output; ``backward`` costs one adjoint recurrence (no second derivatives).
@@ -118,6 +117,16 @@ class LFR(nn.Module):
         self, u: Tensor, x0: Tensor | None, start: Start, return_state: bool
     ) -> tuple[Tensor, Tensor]:
         """Output and last state."""
+        if torch.onnx.is_in_onnx_export() or torch.compiler.is_compiling():
+            raise InputError(
+                "an LFR runs in machine code, which torch.export and torch.onnx.export cannot "
+                "follow; lfrtorch.export.write(model, 'onnx', FOLDER) writes a lfrtorch.Model, "
+                "which has such a layer."
+            )
+        if self.cell.autocast:
+            u, x0 = self.cell.uncast(u, x0)
+            with torch.autocast(self.cell.A.device.type, enabled=False):
+                return self._simulated(u, x0, start, return_state)
         if isinstance(u, Tensor) and u.ndim == 2:  # one record
             x0 = x0.unsqueeze(0) if isinstance(x0, Tensor) else x0
             y, end = self._simulated(u.unsqueeze(0), x0, start, return_state)

@@ -8,9 +8,11 @@ from reference import normal, random_cell
 from torch import Tensor
 from torch.autograd import gradcheck
 from torch.nn.utils import parameters_to_vector
+from torch.nn.utils.parametrizations import weight_norm
 from torch.testing import assert_close
 
-from lfrtorch._support.errors import LfrtorchError
+from lfrtorch._support.errors import InputError, LfrtorchError
+from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.records import Start
@@ -227,6 +229,56 @@ def test_a_model_of_a_dtype_without_kernels_is_refused():
     lfr = small().bfloat16()
     with pytest.raises(ValueError, match=r"dtype is torch\.bfloat16; give torch\.float64"):
         lfr(torch.zeros(1, 5, 2).bfloat16())
+
+
+@pytest.mark.parametrize("inside", [False, True], ids=["backward behind it", "backward in it"])
+def test_autocast_leaves_the_layer_in_the_dtype_of_its_weights(inside: bool):
+    lfr = LFR(random_cell(2, 2, 2, 2, 1, 2, dtype=torch.float32))
+    u = normal(2, 20, 2).bfloat16().requires_grad_()
+    expected = lfr(u.float())
+    wanted = torch.autograd.grad(expected.square().sum(), [u, *lfr.parameters()])
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        y, x = lfr(u, return_state=True)
+        step, ahead = lfr.cell(u[:, 0], u.new_zeros(2, 2))
+        if inside:
+            y.square().sum().backward()
+    if not inside:
+        y.square().sum().backward()
+    assert_close(y, expected, rtol=0, atol=0)
+    assert_close(step, expected[:, 0])
+    assert y.dtype == x.dtype == step.dtype == ahead.dtype == torch.float32
+    assert_close([u.grad, *(p.grad for p in lfr.parameters())], list(wanted))
+
+
+def test_autocast_lets_a_larger_model_train():
+    lfr = LFR(random_cell(2, 2, 2, 2, 1, 2, dtype=torch.float32))
+    model = torch.nn.Sequential(torch.nn.Linear(3, 2), lfr, torch.nn.Linear(2, 1))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        y = model(torch.ones(2, 10, 3))
+        y.square().mean().backward()
+    assert y.dtype == torch.bfloat16
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_exports_of_torch_are_refused_with_those_of_the_package(alone: bool):
+    u, lfr = torch.zeros(1, 5, 2, dtype=torch.float64), small()
+    model = lfr if alone else torch.nn.Sequential(lfr)
+    with pytest.raises(InputError, match=r"lfrtorch\.export\.write\(model, 'onnx', FOLDER\)"):
+        torch.export.export(model, (u,))
+
+
+@pytest.mark.filterwarnings("ignore:There is a performance drop")  # torch's, of weight_norm
+def test_a_parametrised_weight_is_refused_and_a_map_of_torchs_layers_may_have_one():
+    lfr = small()
+    assert lfr.cell.static is not None
+    weight_norm(lfr.cell.static, "Wz")
+    with pytest.raises(InputError, match=r"static\.Wz is no parameter any more"):
+        lfr(torch.zeros(1, 5, 2, dtype=torch.float64))
+    inner = weight_norm(torch.nn.Linear(2, 1, dtype=torch.float64))
+    own = LFR(LFRCell(2, 2, 2, 2, 1, torch.nn.Sequential(inner), dtype=torch.float64))
+    own(normal(1, 5, 2)).square().sum().backward()
+    assert all(p.grad is not None for p in inner.parameters())
 
 
 def test_a_weight_that_was_put_in_with_another_shape_is_refused():
