@@ -11,11 +11,11 @@
 extern "C" {
 #endif
 
-/* The state to start from: x = 0, as the model's simulations do. */
+/* The state to start from: x = 0, where lfrtorch simulate begins. */
 void {{ name }}_reset(double x[{{ NAME }}_NX]);
 
 {% if rest %}
-/* The state at rest with the inputs at their operating point. */
+/* The state that stays with the inputs at their operating point; no simulation begins here. */
 void {{ name }}_rest(double x[{{ NAME }}_NX]);
 
 {% endif %}
