@@ -369,6 +369,7 @@ def scored_run(
         searched=choice is not None or ahead is not None,
         trainer=settings.trainer,
         verdict=verdict,
+        residuals=residuals,
     )
     known = None
     if known_parts(model.lfr.cell.static) is not None:

@@ -92,6 +92,8 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             # Most lines of advice that are printed; the report has all.
             for item in found.advice[:5]:
                 print(f"next: {item.text}\n      ({item.evidence})")
+                if typed := item.command(command):
+                    print(f"      {typed}")
             if found.verdict.use == LINEAR_MODEL:
                 checkpoint = shlex.quote(f"checkpoint={folder / 'linear'}")
                 print(

@@ -7,7 +7,8 @@ The numbers, and the thresholds that several rules share, are those of
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import shlex
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -36,20 +37,52 @@ class Advice(NamedTuple):
     text: str  # the sentence, in at most 160 characters
     evidence: str  # the numbers that it rests on
     change: Mapping[str, Any] | None = None  # fields of the settings, if a program can follow it
+    words: str = ""  # of the command line, if they are not those of the change
+
+    def command(self, before: str) -> str:
+        """The command of the run with what is advised; empty if no word of it follows it.
+
+        Example:
+            >>> Advice("", "", {"ridge": "auto"}).command("lfrtorch fit x.csv fs=10 ridge=1e-3")
+            'lfrtorch fit x.csv fs=10 ridge=auto'
+        """
+        words = shlex.split(self.words) or _typed(self.change or {})
+        # A run has its words spelt out: data.validation=0.2.
+        named = tuple(f"{word.partition('=')[0]}=" for word in words)
+        kept = [w for w in shlex.split(before) if not w.removeprefix("data.").startswith(named)]
+        return shlex.join([*kept, *words]) if words and before else ""
 
     def __str__(self) -> str:
         return f"{self.text} ({self.evidence})"
 
 
+class Row(NamedTuple):
+    """A rule as a row of a table: it speaks where a number is beyond its limit."""
+
+    number: Callable[[Evidence], float | None]
+    limit: float
+    sentence: Callable[[Evidence], str]
+    because: Callable[[Evidence], str]
+    change: Callable[[Evidence], Mapping[str, Any] | None] = lambda _: None
+    words: str = ""
+
+    def __call__(self, e: Evidence) -> Advice | None:
+        """What it advises, if anything."""
+        number = self.number(e)
+        if number is None or number <= self.limit:
+            return None
+        return Advice(self.sentence(e), self.because(e), self.change(e), self.words)
+
+
 def advise(evidence: Evidence) -> list[Advice]:
     """All that the numbers suggest, the most useful first."""
     # At the noise, and where the inputs explain little, there is no advice on sizes and search.
-    return [
-        found
-        for rule, on_the_model in _RULES
-        if not (on_the_model and (evidence.noise_limited or evidence.unexplained))
-        and (found := rule(evidence)) is not None
-    ]
+    e = evidence
+    without = e.noise_limited or e.nothing_left or e.unexplained
+    rules = [rule for rule, on_the_model in _RULES if not (on_the_model and without)]
+    found = [advice for rule in rules if (advice := rule(e)) is not None]
+    # More is not to be measured while there is something else to do.
+    return found or [advice for advice in [noise_unknown(e)] if advice is not None]
 
 
 def diverges(e: Evidence) -> Advice | None:
@@ -76,6 +109,7 @@ def starts_in_a_transient(e: Evidence) -> Advice | None:
         "their starts (start='estimated').",
         f"in their first twentieth the training error is {number(e.transient)} times that of "
         f"the rest, and a free response explains {percent(e.free)} of its power",
+        words="start=estimated",
     )
 
 
@@ -87,6 +121,7 @@ def nothing_held_out(e: Evidence) -> Advice | None:
         ("Hold" if e.lost_on_tests else "Overfitting would not show: hold")
         + " out a part (validation=0.2) to choose iterations and sizes, then fit all with them.",
         f"{e.parameters} parameters are fitted to {e.samples} samples",
+        words="validation=0.2",
     )
 
 
@@ -99,6 +134,7 @@ def validation_is_unlike(e: Evidence) -> Advice | None:
         "(validation=0.4), or records by name (validation=[NAME]).",
         f"error of the linear model: validation {percent(e.linear_validation)}, "
         f"training {percent(e.linear_train)}",
+        words="validation=0.4",
     )
 
 
@@ -131,6 +167,7 @@ def gain_is_lost(e: Evidence) -> Advice | None:
         f"The gain on {which} is lost on the tests: they are unlike, or the model is overfit; "
         "hold out a longer part (validation=0.4), or measure longer.",
         f"error over the linear model's: {which} {percent(e.gain)}, tests {percent(e.tests)}",
+        words="validation=0.4",
     )
 
 
@@ -146,13 +183,52 @@ def at_the_noise(e: Evidence) -> Advice | None:
     )
 
 
+nothing_moves = Row(
+    lambda e: float(e.settled),
+    0.0,
+    lambda e: (
+        "Nothing held out moves: test with another record (test=FILE.csv), or put the part "
+        "that moves last."
+    ),
+    lambda e: "inputs and outputs of all parts that were held out have settled",
+    words="test=FILE.csv",
+)
+
+nothing_left = Row(
+    lambda e: float(e.nothing_left),
+    0.0,
+    lambda e: (
+        "Nothing is left to find: the errors are white, and as large as the noise seems to be."
+    ),
+    lambda e: (
+        f"training error {percent(e.train)}, noise by the quietest part of the spectrum "
+        f"{percent(e.guess)} of the output's standard deviation"
+    ),
+)
+
+ended_by_limit = Row(
+    lambda e: float(e.spent and e.falling <= FALLING and (e.overfit or 0.0) <= _CLOSE),
+    0.0,
+    lambda e: (
+        f"The limit of {e.iterations} iterations ended every start: "
+        + ("init_from=RUN goes on from here, " if e.searched else "")
+        + f"trainer.max_iter={4 * e.iterations}."
+    ),
+    lambda e: (
+        f"kept iteration {e.iterations} of {e.iterations}"
+        + ("; where sizes are chosen the limit is what their ridge was chosen with" * e.searched)
+    ),
+    lambda e: None if e.searched else {"trainer": replace(e.trainer, max_iter=4 * e.iterations)},
+)
+
+
 def still_falling(e: Evidence) -> Advice | None:
     """The iterations ended before the search did, and the error that falls is on validation."""
     if e.falling <= FALLING or e.validation is None:
         return None
     limit = 4 * max(e.iterations, 1)
     return Advice(
-        f"Still falling: max_iter={limit}; init_from=MODEL goes on from here.",
+        f"Still falling: trainer.max_iter={limit}; init_from=RUN goes on from here.",
         f"at the pace of the last iterations the validation error falls by {percent(e.falling)} "
         f"in a tenth of the {e.iterations}",
         {"trainer": replace(e.trainer, max_iter=limit)},
@@ -163,10 +239,13 @@ def overfits(e: Evidence) -> Advice | None:
     """Validation much above training, or rising while training goes on."""
     if e.parts_differ:
         return None
-    if e.overfit is not None and e.overfit > OVERFIT:
+    part, growth = max(e.growths.items(), key=lambda item: item[1], default=("", 0.0))
+    if growth > OVERFIT:
+        if part == "test" and e.lost_on_tests:
+            return None  # said there
         evidence = (
-            f"validation error {percent(e.validation)}, training error {percent(e.train)}: "
-            f"{number(e.overfit)} times the growth of the linear model's"
+            f"{part} error {percent(e.test if part == 'test' else e.validation)}, training error "
+            f"{percent(e.train)}: {number(growth)} times the growth of the linear model's"
         )
     elif e.overtrained:
         evidence = (
@@ -325,7 +404,7 @@ def choose_sizes(e: Evidence) -> Advice | None:
 
 def noise_unknown(e: Evidence) -> Advice | None:
     """No telling whether the error is noise."""
-    if e.noise is not None or e.train is None or e.structured:
+    if e.noise is not None or e.guess is not None or e.train is None or e.structured:
         return None
     return Advice(
         "It is unknown whether the remaining error is noise: measure two periods of a periodic "
@@ -342,7 +421,9 @@ _RULES = (  # the most useful first, and whether a rule is on the sizes or the s
     (gain_is_lost, False),
     (nothing_held_out, False),
     (starts_in_a_transient, False),
+    (nothing_moves, False),
     (at_the_noise, False),
+    (nothing_left, False),
     (overfits, True),
     (linear_part_incomplete, True),
     (hardly_better, True),
@@ -352,8 +433,8 @@ _RULES = (  # the most useful first, and whether a rule is on the sizes or the s
     (best_start_alone, True),
     (one_start, True),
     (still_falling, True),
+    (ended_by_limit, True),
     (tests_are_louder, False),
-    (noise_unknown, False),
 )
 
 
@@ -382,6 +463,14 @@ def _weights(sizes: Mapping[str, int]) -> int:
     if sizes.get("degree"):
         static = nw * math.comb(nz + sizes["degree"], nz)
     return max(1, static) * max(1, sizes.get("nx", 0))
+
+
+def _typed(change: Mapping[str, Any]) -> list[str]:
+    """The change as words of the command line."""
+    return [
+        f"trainer.max_iter={value.limit}" if name == "trainer" else f"{name}={value}"
+        for name, value in change.items()
+    ]
 
 
 def _written(change: Mapping[str, Any]) -> str:

@@ -17,15 +17,18 @@ from scipy.special import fdtrc
 from lfrtorch._support.reasons import SPENT, Reason
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.densities import noise_of_periods
+from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.fitting.trainer import FitResult, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import UNLIKE
 from lfrtorch.metrics import rms
 from lfrtorch.paired_blocks import BLOCKS, blocked_mean, in_blocks
-from lfrtorch.reporting.evaluation import Response
+from lfrtorch.records import Record
+from lfrtorch.reporting.evaluation import Response, has_settled, training_deviations
 from lfrtorch.reporting.explained import explained_parts
 from lfrtorch.reporting.verdict import NEITHER, Kind, Verdict
+from lfrtorch.survey.signal import survey_signal
 
 NOISE_LIMITED = 1.1
 """Training error over the noise up to which the model's own share, √(1.1² - 1), is below half of
@@ -60,7 +63,13 @@ Bouc-Wen and Silverbox, 0.00 and 0.10 for good NL-LFRs."""
 EXTRAPOLATES = 1.25
 """Largest input of a test over the largest in training, above which the model extrapolates."""
 
+AS_GUESSED = 1.25
+"""Training error over a guess of the noise up to which white residuals are noise: a guess is half
+of what the noise is, or twice that, where it is wrong."""
+
 _BEGINNING = 0.05  # part of a record that is its beginning
+
+_CHANCE = 0.01  # probability from which on a correlation is one by chance
 
 LAST = 5
 """Iterations that the pace of a search is taken from, at least; of a long one the last tenth."""
@@ -98,7 +107,12 @@ class Evidence:
     louder: Mapping[str, float] = field(default_factory=dict)  # largest input / training's, by test
     apart: Mapping[str, float] = field(default_factory=dict)  # deviation among starts, if a mean
     diverged: Sequence[str] = ()  # names of records
-    tests: float | None = None  # the NL-LFR's error over the linear model's on all tests together
+    test: float | None = None  # errors on all tests together
+    linear_test: float | None = None
+    guess: float | None = None  # of the noise, from the spectra; where it is not known
+    white: bool = False  # whether the residuals are, and depend on no input
+    spent: bool = False  # whether the limit ended every start, and the last iterate was kept
+    settled: bool = False  # whether all that was held out has settled
     verdict: Verdict | None = None  # which advice must agree with
 
     @property
@@ -146,14 +160,27 @@ class Evidence:
         return self.tests > USELESS
 
     @property
+    def tests(self) -> float | None:
+        """The NL-LFR's error over the linear model's on all tests together."""
+        return self.test / self.linear_test if self.test and self.linear_test else None
+
+    @property
+    def growths(self) -> dict[str, float]:
+        """Growth of the error from training to other parts over that of the linear model."""
+        # What grows for the linear model as well lies in the records, and louder tests extrapolate.
+        parts = {"validation": (self.validation, self.linear_validation)}
+        if not self.settled and all(ratio <= EXTRAPOLATES for ratio in self.louder.values()):
+            parts["test"] = self.test, self.linear_test
+        return {
+            name: error / self.train / max(1.0, linear / self.linear_train)
+            for name, (error, linear) in parts.items()
+            if error and linear and self.train and self.linear_train
+        }
+
+    @property
     def overfit(self) -> float | None:
-        """Growth of the error from training to validation over that of the linear model."""
-        errors = self.train, self.linear_train, self.validation, self.linear_validation
-        if not all(errors):
-            return None
-        train, linear_train, validation, linear_validation = (error or 0.0 for error in errors)
-        # What grows for the linear model as well lies in the records.
-        return validation / train / max(1.0, linear_validation / linear_train)
+        """The largest of these growths."""
+        return max(self.growths.values(), default=None)
 
     @property
     def overtrained(self) -> bool:
@@ -178,6 +205,15 @@ class Evidence:
         if not SOUND * self.noise <= self.train <= NOISE_LIMITED * self.noise:
             return False
         return self.overfit is None or self.overfit <= OVERFIT
+
+    @property
+    def nothing_left(self) -> bool:
+        """Whether the residuals are white, and as large as the noise seems to be."""
+        if not self.guess or not self.white or self.train is None or self.noise:
+            return False
+        if self.falling > FALLING or (self.overfit or 0.0) > OVERFIT:
+            return False
+        return self.train <= AS_GUESSED * self.guess
 
     @property
     def states_missing(self) -> bool:
@@ -219,6 +255,7 @@ def evidence(
     searched: bool = False,  # whether the sizes were chosen by the data
     trainer: Trainer | None = None,  # Levenberg-Marquardt if not given
     verdict: Verdict | None = None,
+    residuals: Residuals | None = None,
 ) -> Evidence:
     """Measure what advice rests on; the responses are of all records."""
     train, validation, tests = (
@@ -242,8 +279,8 @@ def evidence(
         for test in tests
     }
     transient, free = (None, None) if bla is None else _transient(train, scale, bla)
-    test = _error([r.error for r in tests], scale)
-    linear_test = _error([r.linear_error for r in tests], scale)
+    held_out = [r for r in responses if r.use != "train"]
+    deviations = training_deviations(responses)
     known = result.model.known_states > 0
     return Evidence(
         train=_error([r.error for r in train], scale),
@@ -278,9 +315,30 @@ def evidence(
             if loud[r.record.name] > EXTRAPOLATES
         },
         diverged=[r.record.name for r in responses if r.use != "train" and r.diverged],
-        tests=test / linear_test if test and linear_test else None,
+        test=_error([r.error for r in tests], scale),
+        linear_test=_error([r.linear_error for r in tests], scale),
+        guess=_guess([response.record for response in train], scale) if noise is None else None,
+        white=residuals is not None
+        and all(p > _CHANCE for part in residuals.parts for p in part.p.values()),
+        spent=result.chosen_iteration == result.iterations > 0
+        and all(reason in SPENT for reason in [s.reason for s in result.starts] or [result.reason]),
+        settled=bool(held_out) and all(has_settled(r, deviations) for r in held_out),
         verdict=verdict,
     )
+
+
+def _guess(train: Sequence[Record], scale: Array) -> float | None:
+    """The noise that preview guesses of the longest record, over the scale; None if of no guess."""
+    record = max(train, key=lambda record: record.samples)
+    y, u = record.y[record.skip :], record.u[record.skip :]
+    if record.valid is not None or not len(y):
+        return None
+    found = [
+        survey_signal(own, own, channel, inputs=u).noise
+        for own, channel in zip(y.T, record.outputs, strict=True)
+    ]
+    known = [noise for noise in found if noise is not None]
+    return float(rms(known / scale)) if len(known) == len(found) else None
 
 
 def _apart(result: FitResult, response: Response, scale: Array) -> float:

@@ -75,6 +75,7 @@ def render(
         run=run,
         metrics=run.metrics,
         command=command or UNKNOWN,
+        typed=command,
         config=config,
         date=datetime.now().strftime("%d %B %Y, %H:%M"),
         sizes=static_map(run.metrics["sizes"], run.metrics["known_states"]),

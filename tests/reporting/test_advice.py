@@ -103,7 +103,16 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
             {"verdict": UNUSABLE, "train": 0.95, "linear_train": 0.97, "linear_validation": 0.98},
             "look at the columns",
         ),
-        (advice.gain_is_lost, {"tests": 1.5}, "measure longer"),
+        (advice.gain_is_lost, {"test": 0.03, "linear_test": 0.02}, "measure longer"),
+        (advice.overfits, {"test": 0.06, "linear_test": 0.3}, "Overfit: more data"),
+        (advice.ended_by_limit, {"spent": True}, "init_from=RUN goes on from here, trainer.max_it"),
+        (advice.ended_by_limit, GUESSED | {"spent": True}, "every start: trainer.max_iter=400."),
+        (advice.nothing_moves, {"settled": True}, "test=FILE.csv"),
+        (
+            advice.nothing_left,
+            {"noise": None, "white": True, "guess": 0.018},
+            "Nothing is left to find",
+        ),
     ],
 )
 def test_a_rule_speaks_if_its_number_says_so(rule, change, said):
@@ -115,6 +124,46 @@ def test_a_rule_speaks_if_its_number_says_so(rule, change, said):
     assert found in advise(replace(GOOD, **change))
     if found.change is not None:
         assert replace(SETTINGS, **found.change) != SETTINGS
+
+
+def test_two_periods_are_measured_where_nothing_else_is_to_be_done():
+    unknown = replace(GOOD, noise=None)
+    (alone,) = advise(unknown)
+    assert "two periods" in alone.text
+    for change in ({"guess": 0.018}, {"validation": 0.05}, {"spent": True}):
+        assert not any("two periods" in item.text for item in advise(replace(unknown, **change)))
+
+
+def test_white_errors_at_the_guessed_noise_are_the_end():
+    done = replace(GOOD, noise=None, guess=0.018, white=True, started=1, spent=True)
+    (found,) = advise(done)
+    assert found.text.startswith("Nothing is left to find")
+    for change in ({"white": False}, {"guess": 0.01}, {"validation": 0.05}, {"falling": 0.1}):
+        assert not any(
+            item.text.startswith("Nothing is left") for item in advise(replace(done, **change))
+        )
+
+
+def test_a_gap_to_the_tests_is_no_overfit_if_they_are_louder_or_the_linear_model_has_it():
+    gap = {"test": 0.06, "linear_test": 0.3}
+    for change in ({"louder": {"test": 2.0}}, {"linear_test": 0.6}, {"settled": True}):
+        assert advice.overfits(replace(GOOD, **gap | change)) is None
+
+
+def test_advice_ends_with_the_command_of_the_run_and_what_is_changed():
+    run = "lfrtorch fit 'a b.csv' fs=10 data.validation=0 ridge=1e-3 starts=2"
+    starts = advice.one_start(replace(GOOD, started=1))
+    held_out = advice.nothing_held_out(replace(GOOD, validation=None, linear_validation=None))
+    falling = advice.still_falling(replace(GOOD, falling=0.05))
+    assert starts is not None
+    assert held_out is not None
+    assert falling is not None
+    assert starts.command(run) == run.replace("starts=2", "starts=8")
+    assert (
+        held_out.command(run) == "lfrtorch fit 'a b.csv' fs=10 ridge=1e-3 starts=2 validation=0.2"
+    )
+    assert falling.command(run).endswith(" trainer.max_iter=400")
+    assert advice.Advice("Measure longer.", "").command(run) == ""
 
 
 def test_louder_tests_say_by_how_much_the_starts_differ_there():
@@ -239,26 +288,25 @@ def test_no_system_is_called_linear_where_neither_model_is_usable():
     useless = replace(useless, noise=None, verdict=UNUSABLE)
     texts = [item.text for item in advise(useless)]
     assert texts[0].startswith("The inputs explain little")
-    (other,) = texts[1:]
-    assert other.startswith("It is unknown whether the remaining error is noise:")
-    lost = replace(useless, train=0.8, validation=0.8, tests=1.5)
+    assert not texts[1:]
+    lost = replace(useless, train=0.8, validation=0.8, test=1.5, linear_test=1.0)
     assert lost.lost_on_tests
     assert advice.gain_is_lost(lost) is None
     usable = replace(useless, started=1, searched=False)
     assert advise(usable) == advise(useless)
-    assert len(advise(replace(usable, verdict=verdict(Kind.LINEAR)))) > 2
+    assert len(advise(replace(usable, verdict=verdict(Kind.LINEAR)))) > 1
     first, *_ = advise(replace(usable, linear=0.5))
     assert first.text.startswith("The linear part is incomplete")
 
 
 def test_a_gain_that_the_tests_have_not_asks_for_no_larger_map():
-    lost = replace(GOOD, tests=1.5, outputs={"y1": 0.95, "y2": 0.1})
+    lost = replace(GOOD, test=0.023, linear_test=0.018, outputs={"y1": 0.95, "y2": 0.1})
     texts = [item.text for item in advise(lost)]
     assert texts[0].startswith("The gain on validation is lost on the tests")
     assert not any("nw=" in text for text in texts)
     shown = replace(lost, validation=None, linear_validation=None)
     assert not any("Overfitting would not show" in item.text for item in advise(shown))
-    for change in ({"tests": 0.5}, {"verdict": verdict(Kind.BETTER, "NL-LFR")}):
+    for change in ({"linear_test": 0.05}, {"verdict": verdict(Kind.BETTER, "NL-LFR")}):
         texts = [item.text for item in advise(replace(lost, **change))]
         assert texts[0].startswith("Some outputs gain nothing")
 
@@ -286,7 +334,7 @@ def test_advice_asks_for_settings_that_there_are():
     constants = [n.value for n in ast.walk(source) if isinstance(n, ast.Constant)]
     texts = [text for text in constants if isinstance(text, str)]
     asked = re.findall(r"(?<![\w.])([a-z_.]+)=", "\n".join(texts))
-    assert {"validation", "ridge", "starts", "skip", "init_from", "max_iter"} <= set(asked)
+    assert {"validation", "ridge", "starts", "skip", "init_from", "trainer.max_iter"} <= set(asked)
     assert [name for name in asked if name not in known] == []
 
 
