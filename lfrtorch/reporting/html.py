@@ -30,28 +30,26 @@ from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import poles_at_rest
 from lfrtorch.analysis.residual_analysis import LEGEND as RESIDUALS_LEGEND
 from lfrtorch.fitting.choice import LEGEND, choice_table
-from lfrtorch.fitting.trainer import FitResult
-from lfrtorch.linear.model import LinearModel
 from lfrtorch.records import common_unit
 from lfrtorch.reporting.evaluation import Evaluation, training_deviations
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.score_columns import (
     ALL,
-    USES,
     Row,
     columns,
     in_units,
     of_samples,
     rows_of,
     start_matters,
+    use_of,
 )
 from lfrtorch.reporting.scores import (
+    in_words,
     linear_name,
     origins,
     own_linear,
     stability,
     starts,
-    static_map,
 )
 from lfrtorch.reporting.verdict import LINEAR_MODEL, of_linear
 
@@ -78,7 +76,7 @@ def render(
         typed=command,
         config=config,
         date=datetime.now().strftime("%d %B %Y, %H:%M"),
-        sizes=static_map(run.metrics["sizes"], run.metrics["known_states"]),
+        sizes=in_words(run.metrics),
         comparisons=comparisons(run.evaluation),
         linear_is_used=run.verdict.use == LINEAR_MODEL,
         used="RUN/linear" if run.verdict.use == LINEAR_MODEL else "RUN",
@@ -86,7 +84,7 @@ def render(
         data=_data(run.evaluation),
         records=[{"name": name, "views": list(own.items())} for name, own in (views or {}).items()],
         residuals_legend=RESIDUALS_LEGEND,
-        linear=_linear(run.linear, run.fit),
+        linear=_linear(run),
         known=([], []) if run.parameters is None else run.parameters.rows(),
         fit=_fit(run),
         search=(len(tried), choice_table(tried), LEGEND.splitlines()),
@@ -193,7 +191,7 @@ def _data(evaluation: Evaluation) -> dict[str, Any]:
             factor, unit = engineering([moments[1]], channel.unit)
             channels.append([channel.name, side, unit, *(factor * moment for moment in moments)])
     records = [
-        [r.name, USES.get(one.use, one.use), r.source, r.start, of_samples(one.score.entry()),
+        [r.name, use_of(one.use, r.name), r.source, r.start, of_samples(one.score.entry()),
          r.period]
         for one, r in ((response, response.record) for response in evaluation.simulations)
     ]  # fmt: skip
@@ -219,7 +217,8 @@ def _moments(x: Array) -> list[float]:
     return [mean, deviation, float(np.min(x)), float(np.max(x))]
 
 
-def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
+def _linear(run: Run) -> dict[str, Any]:
+    bla, result = run.linear, run.fit
     summary, notes = f"Order {bla.nx}.", ()
     if bla.fit is not None:
         notes = bla.fit.notes
@@ -227,6 +226,12 @@ def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
             f"Order {bla.nx}, {bla.fit.criterion} error {number(bla.fit.rmse)} (normalised), "
             f"{_count(bla.fit.iterations, 'iteration')}, {bla.fit.reason}."
         )
+    if run.order_scan is not None:
+        scanned = bla.nx == run.order_scan.chosen
+        chooser = "scan over orders" if scanned else "cross-validation of the sizes"
+        summary += f" The {chooser} chose the order."
+        if run.settings.nx != bla.nx:
+            summary += f" The NL-LFR begins with order {run.settings.nx}, as its sizes were chosen."
     caption = "Frequency response of the model, over the measured one if the records give one"
     if bla.covariance is not None:
         caption += "; band: ± 2 standard deviations"

@@ -21,6 +21,7 @@ from lfrtorch._support.drawing import (
     OUTPUT,
     legend_above,
     plain_ticks,
+    reference,
     unit_axis,
 )
 from lfrtorch._support.tables import engineering, factor_of, quantity
@@ -61,8 +62,8 @@ def spectrum(record: Record, simulated: Simulated, outputs: Sequence[int] | None
     for i, ax in axes.items():
         for signal, label, colour, _ in _signals(record, simulated, i):
             ax.plot(f[1:-1], _decibel(signal)[1:-1], ".", ms=2, color=colour, label=label)
-        unit = record.outputs[i].unit or "1"
-        ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {unit})", xlim=(0, f[-1]))
+        output = record.outputs[i]
+        ax.set(ylabel=f"{output.name} (dB{reference(output.unit)})", xlim=(0, f[-1]))
         legend_above(ax, markerscale=5)
     _frequency_axis(record, figure.axes[-1])
     return figure
@@ -76,9 +77,9 @@ def density(record: Record, simulated: Simulated, outputs: Sequence[int] | None 
             f, power = power_density(signal[:, None], record.fs)
             level = 10.0 * np.log10(np.maximum(power[:, 0], np.finfo(float).tiny))
             ax.plot(f[1:], level[1:], style, color=colour, label=label)
-        unit = factor_of(record.outputs[i].unit or "1")
-        per = f"{unit}²/Hz" if record.fs != 1.0 else f"{unit}²"
-        ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {per})", xlim=(0, record.fs / 2))
+        output = record.outputs[i]
+        per = f"{factor_of(output.unit)}²{'/Hz' * (record.fs != 1.0)}" if output.unit else ""
+        ax.set(ylabel=f"{output.name} (dB{reference(per)})", xlim=(0, record.fs / 2))
         legend_above(ax)
     _frequency_axis(record, figure.axes[-1])
     return figure

@@ -9,13 +9,18 @@ from typing import Any, NamedTuple
 
 from lfrtorch._support import tables
 from lfrtorch.dataset import Published
-from lfrtorch.reporting.evaluation import Score
+from lfrtorch.reporting.evaluation import CROSS, Score
 
 ALL = "all"
 """Name of several outputs together."""
 
 USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
 """What the report says of a record's use."""
+
+
+def use_of(use: str, record: str) -> str:
+    """What a record was for; what stands for validation in a cross-validation chose nothing."""
+    return "left out in turn" if record.endswith(CROSS) else USES.get(use, use)
 
 
 class Row(NamedTuple):
@@ -71,7 +76,7 @@ _COLUMNS = (
     _Column("record", "tests others", lambda r: r.record if r.key == r.record else ""),
     _Column("record", "linear", lambda r: r.record),
     _Column("use", "terminal linear", lambda r: r.score["use"]),
-    _Column("use", "others", lambda r: USES[r.score["use"]] if r.key == r.record else ""),
+    _Column("use", "others", lambda r: use_of(r.score["use"], r.key) if r.key == r.record else ""),
     _Column("source", "terminal linear", lambda r: r.score["source"].replace("file", "")),
     _Column("scored", "terminal linear", lambda r: of_samples(r.score)),
     _Column("output", "tests others", lambda r: r.output if "outputs" in r.score else ""),

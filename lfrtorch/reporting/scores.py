@@ -167,7 +167,7 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     ]
     linear = linear_name(result)
     if sizes["nz"] or result["known_states"]:
-        shown = static_map(sizes, result["known_states"])
+        shown = in_words(result)
     else:
         linear, rows = "linear", [row._replace(linear=row.error, error=None) for row in rows]
     rows = in_units(rows, others)
@@ -275,6 +275,14 @@ def static_map(sizes: Mapping[str, int], known_states: int = 0) -> str:
     else:
         kind = f"{sizes['nn']} neurons" if sizes["nn"] else "a map of one's own"
     return f"nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {kind}"
+
+
+def in_words(result: Mapping[str, Any]) -> str:
+    """The sizes of the model of what :func:`metrics` returns; of a mean those of each model."""
+    count = 1 if result.get("distilled") else result.get("averaged", 1)
+    each = {name: size // count for name, size in result["sizes"].items()}
+    words = static_map(each, result["known_states"] // count)
+    return f"mean of {count} models with {words}" if count > 1 else words
 
 
 def starts_table(result: Mapping[str, Any], unit: str = "") -> str:

@@ -105,6 +105,7 @@ def test_a_model_that_runs_away_hides_nothing():
     first, last = plots.close_up(RECORD, both(0.9 * Y, lost)).axes[-1].get_xlim()
     assert first < 3.0 < last
     for draw in (plots.spectrum, plots.density):
+        assert draw(RECORD, {}).axes[1].get_ylabel() == "b (dB)"  # its unit is not known
         assert labels(draw(RECORD, both(0.9 * Y, lost)).axes[0])[-1] == "NL-LFR diverges"
     assert legend(plots.distribution(RECORD, both(0.9 * Y, lost)).axes[0])[-1] == "NL-LFR diverges"
 

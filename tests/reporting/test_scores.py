@@ -13,7 +13,7 @@ from lfrtorch.dataset import Dataset, Published
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.evaluation import Evaluation, Response
-from lfrtorch.reporting.score_columns import of_samples
+from lfrtorch.reporting.score_columns import of_samples, use_of
 
 pytestmark = pytest.mark.numeric
 
@@ -167,6 +167,19 @@ def test_what_is_not_finite_becomes_null():
 def test_neurons_in_words():
     sizes = {"nx": 2, "nz": 1, "nw": 1, "nn": 0}
     assert report.static_map(sizes) == "nx 2, nz 1, nw 1, a map of one's own"
+
+
+def test_a_mean_is_called_so_with_the_sizes_of_each_model():
+    summed = {"sizes": {"nx": 6, "nz": 9, "nw": 9, "nn": 48}, "known_states": 0, "averaged": 3}
+    each = "nx 2, nz 3, nw 3, 16 neurons"
+    assert report.in_words({**summed, "distilled": 0}) == f"mean of 3 models with {each}"
+    assert report.in_words({**summed, "averaged": 1}).startswith("nx 6")
+
+
+def test_what_was_left_out_in_turn_chose_nothing():
+    assert use_of("validation", "cross-validation") == "left out in turn"
+    assert use_of("validation", "run, cross-validation") == "left out in turn"
+    assert use_of("validation", "run") == "chooses the iterate"
 
 
 def test_several_outputs_have_a_table_of_their_own():
