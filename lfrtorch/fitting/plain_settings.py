@@ -26,7 +26,7 @@ class PlainSettings:
         None,
         'states. ``"auto"``: the lowest order up to ``nx_max`` whose linear model does as well as '
         'the best, and more if an NL-LFR makes use of them and another size is ``"auto"``, too. '
-        "Required, unless ``init_from`` brings it.",
+        "Required in Python, unless ``init_from`` brings it.",
         least=1,
         word="auto",
     )
