@@ -381,7 +381,7 @@ def scored_run(
     numbers = metrics(
         result,
         evaluation,
-        seeds=settings.seeds,
+        settings=settings,
         choice=choice,
         verdict=verdict,
         refit=again,

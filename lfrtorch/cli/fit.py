@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stdout
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -36,6 +36,7 @@ from lfrtorch.cli.run_folder import (
     CONFIG,
     SNAPSHOTS,
     STARTS,
+    USED,
     WORLD,
     arguments,
     chosen_before,
@@ -85,7 +86,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             raise TerminatedError(f"{stopped}: nothing to keep", number) from None
         if files is not None:
             print(found)
-            config = OmegaConf.to_yaml(files.cfg, resolve=True)
+            config = OmegaConf.to_yaml(files.cfg)
             write(
                 found, folder, command=command, config=config, draw=cfg.figures, board=files.board
             )
@@ -122,10 +123,10 @@ class _Folder(Console):
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
     ) -> Watching:
-        chosen = {**settings.sizes, "starts": settings.starts, "seed": settings.seed}
-        self.cfg = cast(DictConfig, OmegaConf.merge(self.cfg, chosen))
+        asked: Any = OmegaConf.to_container(self.cfg, resolve=True)
+        self.cfg = OmegaConf.create({**asked, USED: settings.used})
         with whole_file(self.folder / CONFIG) as fresh:
-            OmegaConf.save(self.cfg, fresh, resolve=True)
+            OmegaConf.save(self.cfg, fresh)
         shown = (dataset.validation or dataset.train)[0] if self.cfg.figures else None
         y_linear = None if shown is None else linear.simulate(shown)
         self.board = TensorBoard(self.folder, shown, y_linear, say=self.note)

@@ -27,6 +27,9 @@ CONFIG, SNAPSHOTS, STARTS = "config.yaml", "resume", "starts"
 """In the folder of a run: its settings, its starts as far as they came, and events of those that go
 to the end."""
 
+USED = "used"
+"""In the settings there: the numbers that the fit has chosen, or was given."""
+
 OVERRIDES = Path(".hydra", "overrides.yaml")
 """There, too: the words of its command line."""
 
@@ -91,9 +94,10 @@ def chosen_before(cfg: DictConfig, folder: Path) -> DictConfig:
     if cfg.resume is None or cfg.starts != "auto" or not (folder / CONFIG).is_file():
         return cfg
     before = read_settings(folder / CONFIG)
-    if not isinstance(before, dict) or "starts" not in before:
+    used = before.get(USED, before) if isinstance(before, dict) else {}
+    if "starts" not in used:
         raise InputError(f"'{folder / CONFIG}' lacks starts; begin a new run.")
-    return cast(DictConfig, OmegaConf.merge(cfg, {"starts": before["starts"]}))
+    return cast(DictConfig, OmegaConf.merge(cfg, {"starts": used["starts"]}))
 
 
 def program(script: str) -> list[str]:

@@ -227,6 +227,15 @@ class Settings(PlainSettings):
         return {name: getattr(self, name) for name in ("nx", *self.size_names)}
 
     @property
+    def used(self) -> dict[str, Any]:
+        """Sizes, ridge, starts and iterations by name, as numbers where the data have chosen."""
+        names = ("ridge", "starts", "average", "seed")
+        numbers = {name: getattr(self, name) for name in names}
+        if isinstance(self.ridge, Mapping):
+            numbers["ridge"] = dict(self.ridge)
+        return {**self.sizes, **numbers, "max_iter": self.trainer.limit}
+
+    @property
     def seeds(self) -> tuple[int, ...]:
         """Seeds of the starts; neighbouring values of ``seed`` have none in common."""
         return self.first_seeds(1 if self.starts == "auto" else self.starts)

@@ -77,6 +77,7 @@ def render(
         config=config,
         date=datetime.now().strftime("%d %B %Y, %H:%M"),
         sizes=in_words(run.metrics),
+        numbers=", ".join(f"{name} {value}" for name, value in run.metrics["used"].items()),
         comparisons=comparisons(run.evaluation),
         linear_is_used=run.verdict.use == LINEAR_MODEL,
         used="RUN/linear" if run.verdict.use == LINEAR_MODEL else "RUN",

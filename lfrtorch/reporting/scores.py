@@ -17,6 +17,7 @@ from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.dataset import LISTED, Published
 from lfrtorch.fitting.choice import Choice
 from lfrtorch.fitting.forgetting import Memory
+from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.records import common_unit
 from lfrtorch.reporting.evaluation import HORIZONS, Evaluation
@@ -33,7 +34,7 @@ def metrics(
     result: FitResult,
     evaluation: Evaluation,
     *,
-    seeds: Sequence[int],
+    settings: Settings,
     choice: Choice | None = None,
     verdict: Verdict | None = None,
     refit: FitResult | None = None,
@@ -51,6 +52,7 @@ def metrics(
     }
     entries |= {
         "verdict": None if verdict is None else asdict(verdict),
+        "used": settings.used,
         "sizes_search": [] if choice is None else choice.entries(),
         "fit": {
             "iterations": result.iterations,
@@ -75,7 +77,9 @@ def metrics(
         "starts": max(1, len(result.starts)),
         "averaged": result.averaged,
         "distilled": result.distilled,
-        "ranking": [{"seed": seeds[start.number], **asdict(start)} for start in result.starts],
+        "ranking": [
+            {"seed": settings.seeds[start.number], **asdict(start)} for start in result.starts
+        ],
     }
     return finite(entries)
 

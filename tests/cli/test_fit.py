@@ -220,7 +220,7 @@ def test_polynomial_is_chosen_and_continued(csv, tmp_path, capsys):
     fit.run(configuration(*arguments, "static=polynomial", "degree=2"), first)
     cfg = configuration(*arguments, f"init_from={first}")
     fit.run(cfg, second)
-    assert OmegaConf.load(second / "config.yaml").degree == 2
+    assert OmegaConf.load(second / "config.yaml").used.degree == 2
     sizes = json.loads((second / "metrics.json").read_text())["sizes"]
     assert sizes == {"nx": 1, "nz": 1, "nw": 1, "degree": 2}
     assert "nx 1, nz 1, nw 1, polynomial of degree 2" in capsys.readouterr().out
@@ -236,7 +236,7 @@ def test_init_from_says_which_sizes_it_takes(csv, tmp_path, capsys):
     cfg = configuration(*arguments, "nn=auto", f"init_from={first}")
     fit.run(cfg, second)
     saved = OmegaConf.load(second / "config.yaml")
-    assert (saved.nz, saved.nn) == (1, 4)
+    assert (saved.used.nz, saved.used.nn, saved.nn) == (1, 4, "auto")
     assert "nz is 1, that of the model in" in capsys.readouterr().out
     with pytest.raises(InputError, match="a linear model: give the folder of a run") as told:
         fit.run(configuration(*arguments, f"init_from={first / 'linear'}"), second)
@@ -425,7 +425,12 @@ def test_the_mean_of_starts_is_a_model_of_the_run(csv: Path, tmp_path: Path):
     assert judged == metrics["ranking"][0]["train"]
     model = lfrtorch.load(tmp_path)
     assert model.sizes == metrics["sizes"]
-    assert "mean of the best 3" in (tmp_path / "report.html").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert "mean of the best 3" in page
+    assert "the mean of 3 models with nx 1, nz 2, nw 1, 15 neurons" in page
+    assert (
+        "Used: nx 1, nz 2, nw 1, nn 15, ridge 0.0, starts 3, average 3, seed 0, max_iter 3." in page
+    )
 
 
 def test_the_mean_is_of_networks(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -577,12 +582,33 @@ def test_sizes_are_chosen(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     (chosen,) = (t for t in metrics["sizes_search"] if t["chosen"])
     saved = OmegaConf.load(tmp_path / "config.yaml")
-    assert (saved.nx, saved.nz, saved.nn) == (chosen["nx"], chosen["nz"], 3)
+    assert (saved.nx, saved.nz, saved.nn, saved.ridge) == ("auto", "auto", 3, 0.0)
+    for used in (saved.used, metrics["used"]):
+        assert (used["nx"], used["nz"], used["nn"]) == (chosen["nx"], chosen["nz"], 3)
+        assert used["ridge"] == chosen["ridge"] > 0.0
     assert chosen["ratio"] < 0.5
-    assert (cfg.nx, cfg.nz) == ("auto", "auto")  # what was asked for stays
     printed = capsys.readouterr().out
     assert "sizes: nx 1, nz 1, nw 1, nn 3: " in printed
     assert printed.count("  chosen\n") == 2  # the order, and these
+
+
+@pytest.mark.numeric
+@pytest.mark.usefixtures("short_paths")
+def test_the_configuration_of_a_run_of_chosen_sizes_makes_it_again(csv: Path, tmp_path: Path):
+    sizes = ["nx=1", "nz=1", "nw=1", "nn=auto"]
+    cfg = configuration(*file_overrides(csv), *sizes, "trainer.max_iter=2")
+    found = []
+    for name in ("first", "again"):
+        folder = tmp_path / name
+        fit.run(cfg, folder)
+        found.append(json.loads((folder / "metrics.json").read_text()))
+        cfg = OmegaConf.load(folder / "config.yaml")
+        assert isinstance(cfg, DictConfig)
+    first, again = found
+    assert first["scores"] == again["scores"]
+    assert first["ranking"] == again["ranking"]
+    assert first["used"] == again["used"]
+    assert first["used"]["average"] > 1
 
 
 @pytest.mark.numeric
@@ -592,7 +618,7 @@ def test_degree_is_chosen_with_adam(csv: Path, tmp_path: Path):
     cfg = configuration(*arguments, "trainer=adam", "trainer.max_iter=4")
     fit.run(cfg, tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
-    assert metrics["sizes"]["degree"] == OmegaConf.load(tmp_path / "config.yaml").degree
+    assert metrics["sizes"]["degree"] == OmegaConf.load(tmp_path / "config.yaml").used.degree
     assert {t["degree"] for t in metrics["sizes_search"]} >= {3}
 
 

@@ -77,7 +77,9 @@ class Run:
         return self.evaluation.simulations
 
     def page(self, advice: tuple[Advice, ...] = (), search=(), residuals=None, config="") -> Page:
-        metrics = report.metrics(self.result, self.evaluation, seeds=range(2))
+        metrics = report.metrics(
+            self.result, self.evaluation, settings=lfrtorch.Settings(nx=2, starts=2)
+        )
         found = lfrtorch.Run(
             dataset=self.dataset,
             settings=lfrtorch.Settings(nx=2),

@@ -63,7 +63,11 @@ def test_starts_are_ranked_in_files_and_in_a_table(result):
     models = [lfrtorch.initialise(bla, data.train, nz=1, nw=1, nn=3, seed=seed) for seed in SEEDS]
     trainer = lfrtorch.LevenbergMarquardt(max_iter=4)
     fitted = lfrtorch.fit(models, data.train, data.validation, trainer=trainer)
-    metrics = report.metrics(fitted, evaluated(fitted, bla, data), seeds=SEEDS)
+    metrics = report.metrics(
+        fitted,
+        evaluated(fitted, bla, data),
+        settings=lfrtorch.Settings(nx=2, starts=3, seed=SEEDS[0]),
+    )
     assert json.loads(json.dumps(metrics, allow_nan=False)) == metrics
     assert metrics["starts"] == 3
     assert sorted(start["seed"] for start in metrics["ranking"]) == SEEDS
@@ -82,7 +86,9 @@ def test_a_test_may_have_a_linear_model_of_its_own(result):
     fitted, bla, data = result
     data = replace(data, linear={"test": ("train",)})
     own = lfrtorch.estimate_bla(data.train, nx=1)
-    metrics = report.metrics(fitted, evaluated(fitted, bla, data, own={"test": own}), seeds=[0])
+    metrics = report.metrics(
+        fitted, evaluated(fitted, bla, data, own={"test": own}), settings=lfrtorch.Settings(nx=2)
+    )
     expected = lfrtorch.rmse(data.tests[0], own.simulate(data.tests[0]))
     assert metrics["scores"]["test"]["lti_rmse"] == expected
     assert metrics["linear"] == {"test": ["train"]}
@@ -92,7 +98,7 @@ def test_a_test_may_have_a_linear_model_of_its_own(result):
 
 def test_metrics_are_what_the_model_scores(result):
     fitted, bla, data = result
-    metrics = report.metrics(fitted, evaluated(fitted, bla, data), seeds=[0])
+    metrics = report.metrics(fitted, evaluated(fitted, bla, data), settings=lfrtorch.Settings(nx=2))
     test, validation = data.tests[0], data.validation[0]
     y_hat = fitted.model.simulate(test)
     assert metrics["scores"]["test"] == {
@@ -133,7 +139,7 @@ def test_pooled_validation_weighs_samples():
 
 def test_table_shows_published_results_of_these_sizes_only(result):
     fitted, bla, data = result
-    metrics = report.metrics(fitted, evaluated(fitted, bla, data), seeds=[0])
+    metrics = report.metrics(fitted, evaluated(fitted, bla, data), settings=lfrtorch.Settings(nx=2))
     lines = report.table(metrics, data.published).splitlines()
     assert lines[0] == "Simulation RMSE (mV), nx 2, nz 1, nw 1, 3 neurons"
     head, row = lines[2].split(), lines[4].split()
