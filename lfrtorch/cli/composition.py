@@ -39,7 +39,8 @@ SWEEPS = {"-m", "--multirun"}
 """Options that make several runs of several values."""
 
 _SETTING = re.compile(r"[+~]*(?:hydra/)?[\w.]+=")  # what a word NAME=VALUE begins with
-_DATA_CHOSEN = {"config", "linear", "evaluate", "compare"}  # commands whose data are a group
+# Commands whose data are a group.
+_DATA_CHOSEN = {"config", "linear", "evaluate", "compare", "preview"}
 _LISTS = {"data.inputs", "data.outputs", "data.reference"}
 
 

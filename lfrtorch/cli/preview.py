@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 
 from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
@@ -15,7 +16,7 @@ from lfrtorch._support.paths import real
 from lfrtorch.cli.composition import started
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.glance import Glance, look_at
-from lfrtorch.files.load import listed_files, stem_of
+from lfrtorch.files.load import EVERYTHING, is_fraction, listed_files, stem_of
 from lfrtorch.linear.record_start import try_starts
 from lfrtorch.periods import find_period
 from lfrtorch.records import Record, check_rate
@@ -33,15 +34,21 @@ def launch() -> None:
 
 def preview(cfg: DictConfig) -> None:
     """Look at each file."""
-    if cfg.data.path is None:
-        raise InputError("no file is named; give its path, or data.path=FILE.")
-    if cfg.data.fs is not None:
-        check_rate("data.fs", cfg.data.fs)
-    paths = listed_files(cfg.data.path, "data.path")
+    data = cfg.get("data")
+    if data is None or data.get("path") is None:
+        raise InputError("no file is named; give its path, or path=FILE.")
+    if data.fs is not None:
+        check_rate("fs", data.fs)
+    paths = listed_files(data.path, "path")
+    records = {EVERYTHING, *map(stem_of, paths)}
+    for use in ("validation", "test"):
+        of_use = data[use] if isinstance(data[use], ListConfig) else [data[use]]
+        if others := [one for one in of_use if isinstance(one, str) and one not in records]:
+            paths += [path for path in listed_files(others, use) if path not in paths]
     names = [place(path) for path in paths]
     for path, name in zip(paths, names, strict=True):
         own = name if names.count(name) == 1 else f"{name}{path.suffix}"
-        show(path, cfg.data, figure_path(cfg.out, own, len(paths)))
+        show(path, data, figure_path(cfg.out, own, len(paths)))
 
 
 def place(path: Path) -> str:
@@ -69,12 +76,11 @@ def show(path: Path, data: DictConfig, figure: Path) -> None:
     sentences = [*seen.doubts, *(note.text for note in examine(found, seen.u, seen.y))]
     remarks = [*seen.remarks]
     if seen.fs is None:
-        remarks.append("no sampling frequency: give data.fs=HZ; frequencies are in cycles/sample")
+        remarks.append("no sampling frequency: give fs=HZ; frequencies are in cycles/sample")
     if not seen.inputs:
-        remarks.append(
-            "without data.inputs and data.outputs what lies between them is not looked at"
-        )
-    remarks += beginning(seen)
+        remarks.append("without inputs and outputs what lies between them is not looked at")
+    if data.start == "auto":
+        remarks += beginning(seen, data.test)
     print(f"{path}: {len(seen.y)} samples{'' if seen.fs is None else f' at {seen.fs:.6g} Hz'}")
     for remark in remarks:
         print(f"  {remark}")
@@ -91,9 +97,9 @@ def show(path: Path, data: DictConfig, figure: Path) -> None:
     print(f"\nFigure in {figure}\n")
 
 
-def beginning(seen: Glance) -> list[str]:
+def beginning(seen: Glance, test: Any) -> list[str]:
     """How a fit would take the record to begin, if its linear models tell that."""
-    T = round(0.8 * len(seen.y))  # by default the rest is the test
+    T = len(seen.y) - (round(test * len(seen.y)) if is_fraction(test) else 0)
     u, y = seen.u[:T], seen.y[:T]
     if not seen.inputs or not np.isfinite(u).all() or find_period(u) is not None:
         return []

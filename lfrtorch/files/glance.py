@@ -96,14 +96,14 @@ def _roles(
     told = list[str]()
     if inputs is None and outputs is None:
         inputs, outputs, told = table.by_name(inputs, outputs)
-    u = () if inputs is None else table.find(inputs, "data.inputs")
-    y = () if outputs is None else table.find(outputs, "data.outputs")
-    stamps = () if time is None else table.find(time, "data.time")
+    u = () if inputs is None else table.find(inputs, "inputs")
+    y = () if outputs is None else table.find(outputs, "outputs")
+    stamps = () if time is None else table.find(time, "time")
     named = [*u, *y, *stamps]
     twice = [table.headers[i] for i in dict.fromkeys(named) if named.count(i) > 1]
     if twice or len(stamps) > 1:
         raise InputError(
-            f"'{table.path}': {', '.join(map(repr, twice)) or 'data.time'} stands for several; "
+            f"'{table.path}': {', '.join(map(repr, twice)) or 'time'} stands for several; "
             "give every column one use, and one column of times."
         )
     heads, remarks = {}, told

@@ -160,8 +160,8 @@ def load_records(
         period,
         None if skip == "auto" else skip,
         limits,
-        validation=validation if _is_fraction(validation) else 0.0,
-        test=test if _is_fraction(test) else 0.0,
+        validation=validation if is_fraction(validation) else 0.0,
+        test=test if is_fraction(test) else 0.0,
     )
     sources = frame_tables(path) or listed_files(path, "path")
     name = _name([place_of(source) for source in sources])
@@ -483,7 +483,8 @@ def _some(names: Sequence[str]) -> str:
     return shown if len(names) <= 4 else f"{shown} and {len(names) - 4} more"
 
 
-def _is_fraction(use: Use) -> TypeGuard[float]:
+def is_fraction(use: Use) -> TypeGuard[float]:
+    """Tell whether a use is a part of every record."""
     return isinstance(use, Real) and 0 <= float(use) < 1
 
 
@@ -496,7 +497,7 @@ def _taken(
     if isinstance(use, str | Path | Sequence):
         return *_named(option, [use] if isinstance(use, str | Path) else use, wholes, reader), 0.0
     number(option, use)
-    if _is_fraction(use):
+    if is_fraction(use):
         return [], wholes, float(use)
     if use != int(use):
         raise InputError(

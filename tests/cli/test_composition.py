@@ -137,7 +137,7 @@ WHOLE = [*FILE, "data.inputs=[force]", "data.outputs=[disp]", "data.fs=750", "nx
         ("config", "data=file x.csv inputs=0 outputs=2,1", [*FILE, *INPUTS, "data.outputs=[2,1]"]),
         ("evaluate", "checkpoint=m x.csv", ["checkpoint=m", *FILE]),
         ("simulate", "checkpoint=m x.csv inputs=0", ["checkpoint=m", FILE[1], *INPUTS]),
-        ("preview", "x.csv y.mat.csv", ["data.path=[x.csv,y.mat.csv]"]),
+        ("preview", "x.csv y.mat.csv", [FILE[0], "data.path=[x.csv,y.mat.csv]"]),
         ("config", "runs/*.mat test=sweep.csv", [*PATTERN, "data.test=sweep.csv"]),
         ("compare", "folders=runs/a path=x.csv", ["folders=runs/a", *FILE]),
         ("config", "x.csv inputs=null", [*FILE, "data.inputs=null"]),
@@ -198,8 +198,7 @@ def test_paths_that_hydra_would_read_otherwise(tmp_path: Path, monkeypatch: pyte
     path, *other = in_full("simulate", names)
     assert (parsed(path).value(), other) == (names, [])
     for name in names:
-        (word,) = in_full("preview", [name])
-        assert composed("preview", [word]).data.path == name
+        assert composed("preview", in_full("preview", [name])).data.path == name
 
 
 @pytest.mark.parametrize(

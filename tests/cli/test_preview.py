@@ -67,7 +67,7 @@ def run(tmp_path, capsys, monkeypatch):
 def undrawn(monkeypatch):
     """An empty figure, which is written in no time, and no trial of starts."""
     monkeypatch.setattr(preview, "survey_figure", lambda *_: Figure())
-    monkeypatch.setattr(preview, "beginning", lambda _: [])
+    monkeypatch.setattr(preview, "beginning", lambda *_: [])
 
 
 def refused(capsys, *words: str | Path) -> str:
@@ -122,7 +122,7 @@ def test_numbers_of_the_table(signals):
 @pytest.mark.usefixtures("undrawn")
 def test_without_roles_all_columns_are_shown(file: Path, run):
     out = run(file, "out=sub/look.svg")
-    assert "without data.inputs and data.outputs what lies between them is not" in out
+    assert "without inputs and outputs what lies between them is not" in out
     assert "- 'level' has its largest value 0.3" in out
     assert (file.parent / "sub" / "look.svg").read_text().lstrip().startswith("<?xml")
     assert not list(file.parent.glob("*.png"))
@@ -165,7 +165,7 @@ def test_sample_numbers_and_uneven_times(tmp_path: Path, signals, run):
     del numbered["time"]
     out = run(written(tmp_path / "a.csv", numbered))
     assert "'n' is taken for sample numbers" in out
-    assert "no sampling frequency: give data.fs=HZ" in out
+    assert "no sampling frequency: give fs=HZ" in out
     steps = np.random.default_rng(1).uniform(0.5, 1.5, T) / FS
     out = run(written(tmp_path / "b.csv", signals | {"time": np.cumsum(steps)}))
     assert "- the time column 'time' is not evenly spaced: its steps go from" in out
@@ -271,17 +271,18 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
     other = written(file.parent / "ü.csv", {"Füllstand (a)": signals["force"]})
     assert "Füllstand" in run(f"data.path=[{other}]", "data.outputs=[Füllstand (a)]")
     for word, message in (
-        ("data.start=zero", "there is no setting 'data.start'"),
-        ("nx=2", "there is no setting 'nx'"),
-        ("data.inputs=a,b", "has no column 'a', named in data.inputs"),
+        ("sizes=2", "there is no setting 'sizes'"),
+        ("data.inputs=a,b", "has no column 'a', named in inputs"),
         ("data.fs=1,2", "data.fs=1,2 has several values: for a list write data.fs=[1,2]"),
         (f"data.path={file}", "data.path is given twice"),
         ("data.inputs=[a", "is not understood"),
-        ("data.fs=-3", "data.fs is -3; give a positive number"),
-        ("data.fs=1e-320", "data.fs is 1e-320 Hz; give one between 1e-100"),
+        ("data.fs=-3", "fs is -3; give a positive number"),
+        ("data.fs=1e-320", "fs is 1e-320 Hz; give one between 1e-100"),
     ):
         assert message in refused(capsys, file, word)
-    assert "no file is named" in refused(capsys, "data.fs=3")
+    assert "add a file" in refused(capsys, "data.fs=3")
+    for words in ([], ["+bench=boucwen"]):
+        assert "no file is named" in refused(capsys, *words)
     for value in ("5", "0.5", "true", "[1]"):
         assert "give the path of a file, a pattern" in refused(capsys, f"data.path={value}")
     loud = written(file.parent / "loud.csv", {"y": 1e200 * signals["force"]})
@@ -289,10 +290,21 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_the_command_line_of_a_fit_is_that_of_a_preview(file: Path, signals, run, capsys):
+    other = written(file.parent / "other.csv", signals)
+    third = written(file.parent / "third.csv", signals)
+    words = ["inputs=force", "outputs=level", "start=zero", "nx=2", "trainer.max_iter=9"]
+    out = run(file, f"test={other}", f"validation=[lab,{third}]", *words, "figures=false")
+    assert [out.count(f"{path}: {T} samples at 50 Hz") for path in (file, other, third)] == [1] * 3
+    assert run(file, "test=all", *words).count("samples at") == 1
+    assert "there is no file 'gone.csv'" in refused(capsys, file, "test=gone.csv")
+
+
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["data.inputs=mass"], "has no column 'mass', named in data.inputs"),
+        (["data.inputs=mass"], "has no column 'mass', named in inputs"),
         (["data.inputs=force", "data.outputs=force"], "'force (N)' stands for several"),
         (["data.inputs=[force,level]", "data.time=time"], "no column is left for the outputs;"),
         (["out=x.csv"], "out is 'x.csv'; give a name that ends with .png"),
@@ -311,8 +323,9 @@ def test_how_a_fit_would_take_the_record_to_begin(tmp_path: Path, run, monkeypat
     y = lfilter([1.0], [1, -1.96, 0.9702], u) + 0.5 * noise
     y[1010] = np.nan
     words = ["data.inputs=[u]", "data.outputs=[y]", "data.fs=50"]
-    out = run(written(tmp_path / "motion.csv", {"u": u[1000:], "y": y[1000:]}), *words)
-    assert "with an estimated start: start is estimated" in out
+    motion = written(tmp_path / "motion.csv", {"u": u[1000:], "y": y[1000:]})
+    assert "with an estimated start: start is estimated" in run(motion, *words)
+    assert "start is" not in run(motion, *words, "start=zero")
     assert "start is" not in run(written(tmp_path / "few.csv", {"u": u[:30], "y": y[:30]}), *words)
 
 
