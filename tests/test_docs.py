@@ -5,10 +5,13 @@ import shlex
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 import pytest
 from matplotlib import pyplot
+from scipy.signal import lfilter
 
 import lfrtorch
+from lfrtorch.cli import command
 from lfrtorch.cli.composition import composed, first_run, in_full, parsed
 from lfrtorch.cli.quotes import quoted
 
@@ -26,6 +29,9 @@ COMMANDS = sorted(
         for found in COMMAND.findall(page.read_text("utf-8").replace("\\\n", " "))
     }
 )
+
+FEW = ["nx=1", "nz=1", "nw=1", "nn=2", "starts=1", "max_iter=2", "figures=false"]
+"""Words after which a fit takes a second."""
 
 CELL = re.compile(r"^```{code-cell}.*?$(.*?)^```$", re.MULTILINE | re.DOTALL)
 
@@ -63,6 +69,39 @@ def test_command_of_the_guide_has_settings_that_exist(name: str, words: str):
         read = [parsed(word) for word in overrides]
         overrides = [first_run(word) for word in read if not word.is_hydra_override()]
     composed(command, [quoted(word) for word in overrides])
+
+
+@pytest.mark.numeric
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", DOCS / "guide" / "tutorial.md"], ids=lambda page: page.stem
+)
+@pytest.mark.parametrize("more", [FEW, pytest.param([], marks=pytest.mark.slow)], ids=["few", ""])
+def test_commands_run_in_an_empty_folder(
+    page: Path, more: list[str], tmp_path, monkeypatch, capsys
+):
+    """One after another, as a reader types them; a file that the reader has is there."""
+    monkeypatch.chdir(tmp_path)
+    text = page.read_text(encoding="utf-8")
+    if page.stem == "tutorial":
+        exec("".join(re.findall(r"^```python$(.*?)^```$", text, re.MULTILINE | re.DOTALL)), {})
+    else:
+        rng = np.random.default_rng(0)
+        u = rng.standard_normal(600)
+        y = lfilter([0.0, 0.4], [1.0, -0.7], np.tanh(u)) + 0.01 * rng.standard_normal(600)
+        np.savetxt("x.csv", np.c_[u, y], delimiter=",", header="force,disp", comments="")
+    lines = re.findall(r"(?:^    |`)lfrtorch ((?:[a-z]+) [^`\n]+)", text, re.MULTILINE)
+    assert {line.split()[0] for line in lines} >= {"preview", "fit", "export"}
+    whole = next(line for line in lines if line.startswith("fit ")).removeprefix("fit ")
+    for line in lines:
+        typed = line.replace("...", whole).replace("/DATE", "")
+        words = [*shlex.split(typed), *(more if typed.startswith("fit") else [])]
+        monkeypatch.setattr("sys.argv", ["lfrtorch", *words])
+        command.main()
+        assert capsys.readouterr().err == "", line
+    written = {path.name for path in tmp_path.rglob("*")}
+    assert written >= {"metrics.json", "config.yaml", "model.c", "model.h"}
+    assert ("report.html" in written) == (more == [])
+    assert ("predicted.csv" in written) == (page.stem == "tutorial")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

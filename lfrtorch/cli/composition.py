@@ -38,6 +38,7 @@ declared.register()
 SWEEPS = {"-m", "--multirun"}
 """Options that make several runs of several values."""
 
+_DATE = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d-\d{6}")  # hydra.run.dir of a run of its own
 _SETTING = re.compile(r"[+~]*(?:hydra/)?[\w.]+=")  # what a word NAME=VALUE begins with
 # Commands whose data are a group.
 _DATA_CHOSEN = {"config", "linear", "evaluate", "compare", "preview"}
@@ -50,7 +51,7 @@ def take_words(
     unnamed: str = "data.path",
 ) -> None:
     """Check the words, after ``whole`` has completed them, and quote them for Hydra."""
-    given = in_full(command, sys.argv[1:], unnamed)
+    given = [of_newest(word) for word in in_full(command, sys.argv[1:], unnamed)]
     completed = whole(given)
     if command == "config":
         completed = [*completed, *chosen_by_data(completed)]
@@ -68,6 +69,24 @@ def in_full(command: str, given: Sequence[str], unnamed: str = "data.path") -> l
         words.insert(at, "data=file")
     several = not SWEEPS.isdisjoint(words)
     return [_listed(word, several=several) for word in in_groups(command, words)]
+
+
+def of_newest(word: str) -> str:
+    """The word; if it names a folder of runs for a model, the newest of these in its place."""
+    name, _, value = word.partition("=")
+    if name not in ("checkpoint", "init_from") or not is_read(quoted(word)):
+        return word
+    folder = expanded(str(parsed(word).value()))
+    runs = [run for run in folder.glob("*") if _DATE.fullmatch(run.name) and _has_model(run)]
+    if not runs or _has_model(folder):
+        return word
+    newest = max(runs)
+    print(f"note: {name} is {newest}, the newest run in {value}")
+    return f"{name}={_plain_or_quoted(name, str(newest))}"
+
+
+def _has_model(folder: Path) -> bool:
+    return any((folder / inside / "model.json").is_file() for inside in ("", "model", "linear"))
 
 
 def chosen_by_data(words: Sequence[str]) -> list[str]:

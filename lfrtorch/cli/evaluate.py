@@ -1,7 +1,7 @@
 """A trained model on a dataset: checkpoint and records -> table of scores.
 
-lfrtorch evaluate checkpoint=runs/boucwen/DATE +bench=boucwen
-lfrtorch evaluate checkpoint=runs/run/DATE new.csv
+lfrtorch evaluate checkpoint=runs/boucwen +bench=boucwen
+lfrtorch evaluate checkpoint=runs/run new.csv
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A trained model as files of another tool.
 
-lfrtorch export checkpoint=runs/run/DATE to=c name=engine out=firmware
+lfrtorch export checkpoint=runs/run to=c name=engine out=firmware
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A trained model on new inputs: checkpoint and files -> simulated outputs, scores.
 
-lfrtorch simulate checkpoint=runs/run/DATE new.csv out=predicted.csv
+lfrtorch simulate checkpoint=runs/run new.csv out=predicted.csv
 """
 
 from __future__ import annotations

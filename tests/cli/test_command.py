@@ -23,7 +23,7 @@ print("loaded", *sorted({name.split(".")[0] for name in sys.modules}))
 
 
 HELP = {
-    "preview": "PATH data.path= data.inputs= data.outputs= data.fs= data.time= out=",
+    "preview": "PATH path= inputs= outputs= fs= time= test= out=",
     "linear": "data.path= nx=auto bla.refine= frf.method= +bench= linear.json",
     "compare": "FOLDER out= +bench= data=file",
     "evaluate": "checkpoint= out= overwrite=true +bench= data=file effect",

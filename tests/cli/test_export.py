@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from exported import MODELS, OBSERVED
 
 from lfrtorch import NoiseCovariance
 from lfrtorch import export as exports
-from lfrtorch.cli import export
+from lfrtorch.cli import composition, export
 
 
 @pytest.fixture
@@ -35,6 +36,23 @@ def test_c_is_written_with_its_use(folder: Path, monkeypatch, capsys):
         "written: firmware/src/engine.h, firmware/src/engine.c",
         "use: engine_step(x, u, x_next, y);",
     ]
+
+
+def test_a_folder_of_runs_stands_for_the_newest(folder: Path, monkeypatch, capsys):
+    dates = ["2026-09-30_10-00-00-000000", "2026-10-01_09-00-00-000000"]
+    for i, name in enumerate([dates[1], "bla_2027-01-01_00-00-00-000000", dates[0], "mine"]):
+        MODELS["tanh" if i == 0 else "smallest"].save(folder / "runs" / "run" / name / "model")
+    (folder / "runs" / "run" / "2028-01-01_00-00-00-000000").mkdir()  # no model yet
+    run(monkeypatch, "checkpoint=runs/run", "to=c")
+    note, shown, *_ = capsys.readouterr().out.splitlines()
+    assert note == f"note: checkpoint is runs/run/{dates[1]}, the newest run in runs/run"
+    assert shown.startswith(f"runs/run/{dates[1]}: u1 (N), u2 (N)")
+    (folder / "runs" / "run" / dates[1]).rename(folder / "elsewhere")
+    run(monkeypatch, "checkpoint=runs/run", "to=c", "name=before")
+    assert f"checkpoint is runs/run/{dates[0]}" in capsys.readouterr().out
+    monkeypatch.setattr("sys.argv", ["lfrtorch fit", "init_from=runs/run", "nx=2"])
+    composition.take_words("config")
+    assert f"init_from=runs/run/{dates[0]}" in sys.argv
 
 
 def test_an_observer_is_written_with_its_model(folder: Path, monkeypatch, capsys):
