@@ -427,7 +427,7 @@ def test_the_mean_of_starts_is_a_model_of_the_run(csv: Path, tmp_path: Path):
     assert model.sizes == metrics["sizes"]
     page = (tmp_path / "report.html").read_text()
     assert "mean of the best 3" in page
-    assert "the mean of 3 models with nx 1, nz 2, nw 1, 15 neurons" in page
+    assert "mean of 3 models with nx 1, nz 2, nw 1, 15 neurons" in page
     assert (
         "Used: nx 1, nz 2, nw 1, nn 15, ridge 0.0, starts 3, average 3, seed 0, max_iter 3." in page
     )
