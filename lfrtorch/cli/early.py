@@ -24,8 +24,12 @@ from lfrtorch.cli.errors import user_errors
 from lfrtorch.files.excel import EXTENSIONS, workbook
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.loggers import READERS
+from lfrtorch.files.measurement import Wanted, read_measurement
 from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.least_squares.options import AdamOptions, LevenbergMarquardtOptions
+
+_SMALL = 2**22
+"""Bytes of a file up to which it is read twice: a tenth of a second."""
 
 _SIZES = {"nx", "nz", "nw", "nn", "degree"}
 
@@ -42,7 +46,7 @@ def check(command: str) -> None:
         cfg = composed(command, [first_run(parsed(word)) for word in whole])
         if command == "config":
             check_numbers(cfg)
-        check_columns(cfg.get("data"))
+        check_file(cfg.get("data"))
 
 
 def check_numbers(cfg: DictConfig) -> None:
@@ -62,20 +66,24 @@ def check_numbers(cfg: DictConfig) -> None:
         raise InputError(f"trainer: {error}") from None
 
 
-def check_columns(data: Any) -> None:
-    """Refuse a file or columns that are not there, of a single file that opens without delay."""
-    if data is None:
+def check_file(data: Any) -> None:
+    """Refuse a single file, its columns or its sampling frequency, if it is read without delay."""
+    if data is None or data.get("_target_") != "lfrtorch.load_records":
         return
-    path = data.get("path")
+    path = data.path
     if not isinstance(path, str) or {"*", "?"} & set(path):
         return
-    if workbook(expanded(path))[0].suffix.lower() in (*EXTENSIONS, *READERS):
+    file = expanded(path)
+    if workbook(file)[0].suffix.lower() in (*EXTENSIONS, *READERS):
         return  # these are read whole
+    given: Any = OmegaConf.to_container(data)
     try:
-        table = open_table(expanded(path))
+        table = open_table(file)
         for side in ("inputs", "outputs"):
-            if data.get(side) is not None:
-                value: Any = OmegaConf.to_container(data)
-                table.find(value[side], side)
+            if given[side] is not None:
+                table.find(given[side], side)
+        if file.stat().st_size < _SMALL:
+            given["units"] = given["units"] or {}
+            read_measurement(table, Wanted(**{one.name: given[one.name] for one in fields(Wanted)}))
     except (InputError, OSError) as error:
         raise InputError(f"data: {error}") from None

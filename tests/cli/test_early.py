@@ -29,12 +29,16 @@ def file(tmp_path: Path) -> Path:
         (["nxx=3"], "there is no setting 'nxx'; did you mean nx=3?"),
         (["nx=3", "trainer.max_iter=ten"], "trainer: max_iter is 'ten'; give a whole number"),
         (["nx=3", "inputs=power"], "has no column 'power', named in inputs"),
+        (["nx=3", "fs=null"], "data: the sampling frequency of 'x.csv' is not known; give fs=HZ"),
+        (["nx=3", "fs=-1"], "data: fs is -1; give a positive number"),
         (["+bench=boucwe"], "there is no bench=boucwe; give boucwen"),
     ],
 )
 def test_errors_come_before_torch(file: Path, words: list[str], message: str):
-    known = [] if words[0].startswith("+") else [str(file), "outputs=disp", "fs=100"]
-    known += [] if any("inputs" in word for word in words) or not known else ["inputs=force"]
+    known = [] if words[0].startswith("+") else ["x.csv", "outputs=disp"]
+    for word in ("inputs=force", "fs=100"):
+        if known and not any(other.startswith(word.split("=")[0]) for other in words):
+            known.append(word)
     code = ENDS.format(words=[*known, *words])
     code += "\ntry:\n    start('fit')\nfinally:\n    assert 'torch' not in sys.modules"
     ended = subprocess.run(
