@@ -627,8 +627,9 @@ class Scaler:
         return (y - self.y_offset) / self.y_scale
 
     def restore_y(self, y: Array) -> Array:
-        """Output (T, ny) from normalised to physical units."""
-        return y * self.y_scale + self.y_offset
+        """Output (T, ny) from normalised to physical units; infinite where it is too large."""
+        with np.errstate(over="ignore"):  # of a simulation that diverges
+            return y * self.y_scale + self.y_offset
 
 
 def check_start(start: str, what: str) -> None:

@@ -250,6 +250,11 @@ def test_scaler_maps_to_offset_and_scale_and_back():
     assert np.array_equal(scaler.normalise_u(np.array([[3.0, 2.0]])), [[1.0, 0.0]])
     assert np.array_equal(scaler.normalise_y(np.array([[0.0]])), [[2.0]])
     assert np.array_equal(scaler.restore_y(np.array([[2.0]])), [[0.0]])
+    volts = Scaler(np.zeros(1), np.ones(1), np.zeros(1), np.array([1e3]))
+    runs_away = np.array([[1.0], [1e307], [-np.inf], [np.nan]])  # and no warning
+    assert np.array_equal(
+        volts.restore_y(runs_away), [[1e3], [np.inf], [-np.inf], [np.nan]], equal_nan=True
+    )
 
 
 @pytest.mark.numeric
