@@ -93,7 +93,7 @@ def show(path: Path, data: DictConfig, figure: Path) -> None:
     if not sentences:
         print("Nothing found that would hurt a model.")
     with whole_file(figure) as fresh:
-        survey_figure(found, seen.spread(), path.name).savefig(fresh, dpi=110)
+        survey_figure(found, np.hstack([seen.u, seen.y]), path.name).savefig(fresh, dpi=110)
     print(f"\nFigure in {figure}\n")
 
 

@@ -17,6 +17,7 @@ from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.memory import in_bytes
 from lfrtorch.files.arrays import optional
 from lfrtorch.files.loggers import READERS
+from lfrtorch.files.table import rate_behind
 from lfrtorch.files.text import Layout, Line, TextTable, layout_of, with_point
 
 _HEAD = 1000
@@ -38,10 +39,12 @@ EXTENSIONS = (".xlsx", ".xlsm")
 
 def workbook(path: Path) -> tuple[Path, str]:
     """The file of a path and what stands behind it, ``rig.xlsx#Run 2``, empty if nothing."""
-    name, mark, sheet = str(path).rpartition("#")
+    name, mark, behind = str(path).rpartition("#")
     file = Path(name)
-    named = mark and file.suffix.lower() in (*EXTENSIONS, *READERS) and not path.is_file()
-    return (file, sheet) if named else (path, "")
+    if not mark or path.is_file():
+        return path, ""
+    named = file.suffix.lower() in (*EXTENSIONS, *READERS) or (file.suffix and rate_behind(behind))
+    return (file, behind) if named else (path, "")
 
 
 class ExcelTable(TextTable):

@@ -12,7 +12,7 @@ from lfrtorch.files import arrays as array_table
 from lfrtorch.files.excel import EXTENSIONS, ExcelTable, workbook
 from lfrtorch.files.loggers import READERS
 from lfrtorch.files.parquet import ParquetTable
-from lfrtorch.files.table import BLOCK, Table
+from lfrtorch.files.table import BLOCK, Table, rate_behind
 from lfrtorch.files.text import TextTable
 
 __all__ = ["BLOCK", "FORMATS", "Table", "open_table"]
@@ -45,7 +45,7 @@ def open_table(path: str | Path) -> Table:
             f"'{path}' is a folder; name a file"
             + (f": {', '.join(inside[:_SHOWN])}." if inside else ", it has none of a known format.")
         )
-    file, _ = workbook(path)
+    file, behind = workbook(path)
     if file.exists() and not file.is_file():
         raise InputError(f"'{file}' is a pipe or a device; give a file with what comes from it.")
     if not file.is_file():
@@ -59,7 +59,11 @@ def open_table(path: str | Path) -> Table:
         )
     if file.stat().st_size == 0:
         raise InputError(f"'{path}' is empty; give a file with data.")
-    return FORMATS[kind](path)
+    if not behind or kind in (*EXTENSIONS, *READERS):
+        return FORMATS[kind](path)
+    table = FORMATS[kind](file)
+    table.asked = rate_behind(behind)
+    return table
 
 
 def extension(path: Path) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lfrtorch._support.frames import columns_of, index_times, is_frame
 from lfrtorch._support.types import Array
@@ -36,6 +37,12 @@ class FrameTable(Table):
                 else:
                     block[:, place] = columns_of(part, [column - timed])[:, 0]
             yield block
+
+    def labels(self, column: int) -> NDArray[Any]:
+        """See :meth:`Table.labels`."""
+        place = column - (self._times is not None)
+        found = super().labels(column)
+        return found if len(found) else self._frame.iloc[:, place].astype(str).to_numpy(str)
 
 
 def frame_tables(given: Any) -> list[FrameTable]:

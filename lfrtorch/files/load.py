@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
+from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -63,7 +64,7 @@ class _Whole:
 
     record: Record
     path: Path
-    stem: str  # of all stretches of the file
+    stem: str  # of all runs and stretches of the file
     stretch: bool
 
 
@@ -257,11 +258,15 @@ class _Reader:
             measured = self._measured(source)
             several = len(measured.stretches) > 1
             self.note(stem, *measured.notes)
-            if several:
+            runs = Counter(stretch.run for stretch in measured.stretches)
+            if len(measured.stretches) > len(runs):
                 self.note(stem, f"{len(measured.stretches)} stretches between gaps, a record each")
-            before = len(found)
-            for i, stretch in enumerate(measured.stretches, 1):
-                name = f"{stem}_{i}" if several else stem
+            before, count = len(found), Counter[str]()
+            for stretch in measured.stretches:
+                count[stretch.run] += 1
+                place = [stretch.run] if stretch.run else []
+                place += [str(count[stretch.run])] if runs[stretch.run] > 1 else []
+                name = "_".join([stem, *place])
                 try:
                     record, notes = self._record(name, measured, stretch)
                 except TooShortError as error:
@@ -272,7 +277,9 @@ class _Reader:
                     self.note(name, *notes)
                     found.append(_Whole(record, path, stem, several))
             if len(found) == before:
-                raise InputError(f"'{path}': no stretch between its gaps is long enough to score.")
+                raise InputError(
+                    f"'{path}': no run or stretch between gaps is long enough to score."
+                )
         self.all += found
         return found
 
@@ -327,7 +334,7 @@ class _Reader:
         if abs(measured.fs / first.fs - 1) > _SAME:
             raise InputError(
                 f"'{path}' is sampled at {measured.fs:g} Hz and '{first.path}' at {first.fs:g} Hz; "
-                "resample them to one rate."
+                f"'{path}#{first.fs:.6g}Hz' interpolates it to that rate."
             )
         return replace(measured, fs=first.fs)
 
@@ -340,7 +347,7 @@ class _Reader:
         automatic = self.period == "auto"
         N = find_period(u if r is None else r) if automatic else cast("int | None", self.period)
         start: Start = self.start
-        if stretch.first and start not in ("periodic", "measured"):
+        if not stretch.begins and start not in ("periodic", "measured"):
             start = "estimated"
         settling, settled = 0, False
         if N is not None and self.skip is None and start != "estimated":

@@ -9,11 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.sampling import UnevenError, sampling
 from lfrtorch._support.types import Array
 from lfrtorch.files.formats import BLOCK, open_table
-from lfrtorch.files.measurement import find_rate, unusable_time
 from lfrtorch.files.table import Columns, NoColumnError
-from lfrtorch.files.time_stamps import UnevenError, sampling, time_unit
+from lfrtorch.files.time_base import find_base
+from lfrtorch.files.time_stamps import time_unit
 from lfrtorch.records import Channel
 
 _SAME = 1e-3  # relative difference of sampling frequencies that counts as none: clocks differ
@@ -96,21 +97,21 @@ class FileStream:
 
     def _sampled(self) -> tuple[tuple[int, ...], str]:
         """The column of time that the file has, and what it says of its sampling."""
-        rate = find_rate(self.table, [*self.u, *self.y])
-        reason = "" if rate else unusable_time(self.table, [*self.u, *self.y])
-        if reason:
+        base = find_base(self.table, [*self.u, *self.y])
+        if base.why:
             raise InputError(
-                f"'{self.table.path}': {reason}; resample the signals to an even grid, or give "
+                f"'{self.table.path}': {base.why}; resample the signals to an even grid, or give "
                 f"fs={self.fs:g} if the column is wrong."
             )
-        if rate is None:
+        off = base.fs is None or abs(base.fs / self.fs - 1) > _SAME
+        if off and not (base.fs and base.named):
             return (), f"nothing says how it is sampled; the model's {self.fs:g} Hz are taken"
-        if not rate.stamps and abs(rate.fs / self.fs - 1) > _SAME:
+        if off and base.column is None:
             raise InputError(
-                f"'{self.table.path}': {rate.note}, and the model runs at {self.fs:g} Hz; resample "
-                "the signals."
+                f"'{self.table.path}': {base.notes[0]}, and the model runs at {self.fs:g} Hz; "
+                "resample the signals."
             )
-        return rate.stamps, rate.note
+        return () if base.column is None else (base.column,), base.notes[0]
 
     def _found(
         self, wanted: Columns | None, channels: Sequence[Channel], option: str

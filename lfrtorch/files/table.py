@@ -7,7 +7,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ _SIDES = {
 _Row = TypeVar("_Row")
 
 _ALL, _SOME = 24, 20  # columns: up to which a message names all, and of more
+_RATE = re.compile(r"([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*(k?)Hz", re.IGNORECASE)
 _NAME = 60  # characters of a column's name in a list
 
 
@@ -64,6 +65,8 @@ class Table(ABC):
     """What a user should know of how the file is read."""
     contents: Sequence[tuple[str, str, str]] = ()
     """What is in a file of arrays: name and shape of each, and what it is taken for."""
+    asked: float | None = None
+    """The rate in Hz that the signals are to be interpolated to, as in ``x.csv#50Hz``."""
 
     def __init__(
         self,
@@ -89,6 +92,7 @@ class Table(ABC):
         self.refused = dict(refused or {})
         self.rates = dict(rates or {})
         self.lengths = tuple(lengths)
+        self.clocks = clocks
 
     @abstractmethod
     def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
@@ -99,6 +103,13 @@ class Table(ABC):
         Raises:
             ValueError: a damaged file, columns of different lengths, or text that is no number.
         """
+
+    def labels(self, column: int) -> NDArray[Any]:
+        """All entries of a column, which may be words; none if they cannot be read."""
+        try:
+            return self.read([column])[:, 0]
+        except InputError:
+            return np.array([])
 
     def without_footer(self, rows: Iterable[_Row], said: Callable[[_Row], str]) -> Iterator[_Row]:
         """Yield rows without those of words at the end, which a note tells."""
@@ -238,6 +249,13 @@ class Table(ABC):
         names = [brief(repr(column.name), _NAME) for column in self.columns[:_ALL]]
         shown = names if count <= _ALL else [*names[:_SOME], "..."]
         return f"{count} column(s): {', '.join(shown)}"
+
+
+def rate_behind(text: str) -> float | None:
+    """The rate in Hz that stands behind a file, as in ``x.csv#50Hz``; None if it is none."""
+    found = _RATE.fullmatch(text.strip())
+    rate = float(found[1]) * (1000.0 if found[2] else 1.0) if found else 0.0
+    return rate if 0 < rate < np.inf else None
 
 
 class Clock:

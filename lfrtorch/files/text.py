@@ -139,6 +139,14 @@ class TextTable(Table):
                 f"'{self.path}' is damaged or no text ({brief(error)}); write it again."
             ) from error
 
+    def labels(self, column: int) -> NDArray[Any]:
+        """See :meth:`Table.labels`."""
+        found = super().labels(column)
+        if len(found):
+            return found
+        cells = (line.cells for line in self._lines())
+        return np.array([each[column] if column < len(each) else "" for each in cells])
+
     def where(self, sample: int) -> str:
         """The line of a sample."""
         for i, line in enumerate(self._lines()):

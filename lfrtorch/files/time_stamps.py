@@ -1,4 +1,4 @@
-"""Sampling frequency of time stamps, and the samples that are missing among them."""
+"""Columns of time stamps: their names, their units, and the seconds in them."""
 
 from __future__ import annotations
 
@@ -7,13 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lfrtorch._support.errors import InputError
-from lfrtorch._support.types import Array, Integers
+from lfrtorch._support.sampling import Sampling, UnevenError, sampling
+from lfrtorch._support.types import Array
 from lfrtorch.records import Channel
 
-_GAP = 1.5  # steps: from here on samples are missing
-_OFTEN = 0.1  # of the samples: if more steps seem to be gaps, the stamps are rounded
-_ROUNDED = 1.01  # digits: how far a stamp may be from there if the last digit rounds
 _NAMES = re.compile(
     r"(t|time|zeit|uhrzeit|timestamps?|time[ _-]?stamps?|date[ _-]?time|date|sec|seconds?|x_value)",
     re.IGNORECASE,
@@ -35,40 +32,6 @@ _SECONDS = {
 }
 _KNOWN = "s, ms, us, ns, min, h or d"
 _SINCE_1970 = (1e9, 4e9)  # seconds: the years 2001 to 2096
-
-
-class Sampling(NamedTuple):
-    """An even grid of samples."""
-
-    fs: float  # Hz
-    uncertainty: float  # of fs, relative, from the digits of the stamps
-    gaps: Integers  # samples that follow a gap
-    missing: Integers  # how many samples each gap has
-    unit: str = ""  # what the stamps are taken to be in, if their column does not say it
-
-    def __str__(self) -> str:
-        """What a column is taken for: the unit, the frequency and how far it may be off."""
-        unit = f" in {self.unit}" if self.unit else ""
-        # A frequency that is known as well needs no word on that.
-        off = f" ± {100 * self.uncertainty:.1g} %" if self.uncertainty > 1e-3 else ""
-        return f"the time{unit}, {self.fs:.6g} Hz{off}"
-
-
-class UnevenError(InputError):
-    """A column that is no even grid of time: what it does, at which sample, and a remedy."""
-
-    fs = 0.0
-    """The usual sampling frequency in Hz, if there is one."""
-
-    def __init__(
-        self, message: str, sample: int, remedy: str = "resample the signals to an even grid"
-    ) -> None:
-        super().__init__(message)
-        self.sample, self.remedy = sample, remedy
-
-
-class TwiceError(UnevenError):
-    """Time stamps that would be an even grid if some did not stand twice."""
 
 
 class TimeUnit(NamedTuple):
@@ -121,20 +84,23 @@ def time_unit(t: Array, channel: Channel) -> TimeUnit:
     return TimeUnit(1.0)
 
 
-def column_sampling(t: Array, channel: Channel) -> Sampling:
-    """The grid of a column of time stamps (T,), NaN where one is missing; see :func:`sampling`."""
+def seconds(t: Array, channel: Channel) -> tuple[Array, str]:
+    """Time stamps (T,) in s, those that are missing filled in, and a unit that is assumed."""
     unit, known = time_unit(t, channel), np.flatnonzero(np.isfinite(t))
     if not known.size:
         raise UnevenError("has no values", 0)
-    t, first = np.interp(np.arange(known[-1] + 1), known, t[known]), known[0]
-    t[:first] -= float(np.median(np.diff(t[first:]))) * np.arange(first, 0, -1) if first else 0.0
-    t *= unit.seconds
-    try:
-        return sampling(t)._replace(unit=unit.assumed)
-    except UnevenError as error:
-        step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
-        error.fs = 1 / step if step > 0 else 0.0
-        raise
+    k, T = np.arange(len(t)), len(t)
+    step = float(np.median(np.diff(t[known]) / np.diff(known))) if known.size > 1 else 0.0
+    filled = np.interp(k, known, t[known])
+    filled[: known[0]] -= step * np.arange(known[0], 0, -1)
+    filled[known[-1] + 1 :] += step * np.arange(1, T - known[-1])
+    return filled * unit.seconds, unit.assumed
+
+
+def column_sampling(t: Array, channel: Channel) -> Sampling:
+    """The grid of a column of time stamps (T,), NaN where one is missing; see :func:`sampling`."""
+    times, unit = seconds(t, channel)
+    return sampling(times)._replace(unit=unit)
 
 
 def _named(channel: Channel) -> tuple[str, str]:
@@ -152,97 +118,3 @@ def _seconds(unit: str) -> float | None:
     word = unit if unit in ("Ms", "MS") else unit.lower()
     spellings = (word, word.removesuffix("s"), word.removesuffix("n"))
     return next((_SECONDS[one] for one in spellings if one in _SECONDS), None)
-
-
-def sampling(t: Array) -> Sampling:
-    """Return the even grid of time stamps (s), up to rounding; refuse uneven ones."""
-    if len(t) < 2:
-        raise UnevenError("has one sample", 0)
-    digit = _last_digit(t)
-    if _rounded(t, digit):
-        return _grid(t, digit, np.array([], np.int64))
-    steps = np.diff(t)
-    usual = float(np.median(steps))
-    found = np.flatnonzero(steps > _GAP * usual) + 1
-    if len(found) < _OFTEN * len(t):
-        return _grid(t, 0.0, found)
-    return _grid(t, digit, np.flatnonzero(steps > _GAP * usual + _ROUNDED * digit) + 1)
-
-
-def _rounded(t: Array, digit: float) -> bool:
-    """Whether all stamps are on one grid but for their last digit, which shows now and then."""
-    steps, k = np.diff(t), np.arange(len(t)) - (len(t) - 1) / 2
-    away = t - t.mean()
-    away -= k * (k @ away) / (k @ k)  # the line of least squares is off by digit / sqrt(T)
-    shows = np.count_nonzero(np.abs(steps - np.median(steps)) > 0.5 * digit)
-    # The last digit is taken to round if it makes some steps unlike the others.
-    return bool(shows >= 5 and np.ptp(away) <= (1.1 + 3 / np.sqrt(len(t))) * digit)
-
-
-def _grid(t: Array, digit: float, gaps: Integers) -> Sampling:
-    """The grid of stamps between gaps, each within ``digit`` and the jitter of its place."""
-    steps = np.diff(t)
-    within = np.delete(steps, gaps - 1)
-    mean = float(within.mean()) if within.size else 0.0
-    falling = np.flatnonzero(steps < 0)
-    if mean <= 0 or falling.size:
-        k = int(falling[0]) + 1 if falling.size else 1
-        raise UnevenError(f"does not rise: {t[k - 1]:.10g} s is followed by {t[k]:.10g} s", k)
-    starts = np.concatenate([[0], gaps])
-    lengths = np.diff(np.append(starts, len(t)))
-    place = np.arange(len(t)) - np.repeat(starts, lengths)
-    away = t - np.repeat(t[starts], lengths) - place * mean
-    away -= np.repeat(np.add.reduceat(away, starts) / lengths, lengths)
-    # Jitter: so far, in steps, a stamp may be from its place in an even grid.
-    far = np.abs(away) > 0.1 * mean + _ROUNDED * digit
-    if far.any():
-        twice = np.flatnonzero(steps == 0) + 1
-        if 0 < twice.size < _OFTEN * len(t) and _is_grid(np.delete(t, twice)):
-            raise TwiceError(
-                f"has {twice.size} time stamp(s) twice, the first {t[twice[0]]:.10g} s",
-                int(twice[0]),
-                "leave out one sample of each two",
-            )
-        odd = np.abs(steps - np.median(steps))
-        odd[gaps - 1] = 0.0
-        raise UnevenError(
-            f"is not evenly spaced: its steps go from {steps.min():.4g} s to {steps.max():.4g} s",
-            int(np.argmax(odd)) + 1,
-        )
-    rounding = 4 * float(np.spacing(np.abs(t).max()))
-    if np.ptp(within) > 2 * rounding:  # else the digits hold the step exactly
-        rounding = max(rounding, _last_digit(t))
-    uncertainty = rounding * len(starts) / float(within.sum())
-    missing = np.maximum(np.rint(steps[gaps - 1] / mean).astype(np.int64) - 1, 1)
-    return Sampling(_roundest(1 / mean, uncertainty), uncertainty, gaps, missing)
-
-
-def _is_grid(t: Array) -> bool:
-    try:
-        sampling(t)
-    except UnevenError:
-        return False
-    return True
-
-
-def _last_digit(t: Array) -> float:
-    """What the last digit counts of stamps that were printed, or kept in single precision."""
-    largest = float(np.abs(t).max())
-    with np.errstate(over="ignore"):  # beyond single precision
-        single = t.astype(np.float32)
-    if np.array_equal(t, single) and not np.array_equal(t, np.rint(t)):
-        return float(np.spacing(np.float32(largest)))
-    for digits in range(10):
-        scaled = t * 10.0**digits
-        if np.abs(scaled - np.rint(scaled)).max() <= 4 * np.spacing(largest * 10.0**digits):
-            return 10.0**-digits
-    return 0.0
-
-
-def _roundest(value: float, uncertainty: float) -> float:
-    """The number of the fewest digits that is as good."""
-    for digits in range(16):
-        found = float(f"{value:.{digits}e}")
-        if abs(found - value) <= uncertainty * value:
-            return found
-    return value

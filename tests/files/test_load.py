@@ -355,16 +355,66 @@ def test_refused_time(tmp_path):
     refused("fs is 1000 Hz and the time column 't' of .* says 100 Hz", path, use=TIMED, fs=1000)
     refused("time is 'u', which|stands twice", path, use=TIMED, time="u")
     refused("no column 'time', named in time", path, use=TIMED, time="time")
-    jitter = even + 0.003 * np.sin(np.arange(300.0) ** 2)
-    timed(path, jitter)
-    message = refused("'t' is not evenly spaced.* at line", path, use=TIMED)
-    assert f"from {np.diff(jitter).min():.4g} s to {np.diff(jitter).max():.4g} s" in message
-    timed(path, even + 0.004 * (np.arange(300) >= 200))
-    refused("from 0.01 s to 0.014 s, at line 202", path, use=TIMED)
-    timed(path, np.concatenate([even[:100], even[:200]]))
-    refused("does not rise: 0.99 s is followed by 0 s, at line 102", path, use=TIMED)
-    timed(path, np.concatenate([even[:150], even[150:] * 2]))
-    refused("not evenly spaced.*0.01 s to 1.51 s", path, use=TIMED)
+    timed(path, np.concatenate([even[:150], even[100:]]))
+    message = refused("'t' does not rise: 1.49 s is followed by 1 s, at line 152", path, use=TIMED)
+    assert "cut the file there" in message
+    timed(path, np.concatenate([even[:150], even[125:] * 2]))
+    refused(r"time stamps have 1 gap\(s\) of 49 sample", path, use=TIMED)
+
+
+def smooth(path, t, *, decimals: int = 9):
+    """A file of the columns t, u and y that are slow waves over time, seen at ``t``."""
+    u, y = np.sin(t), np.cos(1.3 * t)
+    write(path, np.column_stack([np.round(t, decimals), u, y]), "t,u,y")
+    return path
+
+
+@pytest.mark.numeric
+@pytest.mark.parametrize("use", [BARE, TIMED, BARE | {"fs": 100.0}, TIMED | {"fs": 100.0}])
+def test_uneven_times_are_put_on_an_even_grid(tmp_path, use):
+    rng, k = np.random.default_rng(0), np.arange(900)
+    for t in (
+        (k + rng.uniform(-0.3, 0.3, 900) * (k > 0)) / 100,
+        np.delete(k + rng.uniform(-0.2, 0.2, 900) * (k > 0), [300, 301, 500]) / 100,
+    ):
+        data = load_records(smooth(tmp_path / "a.csv", t), **use, test="all")
+        (record,) = data.tests
+        assert record.fs == pytest.approx(100.0, rel=2e-3)
+        at = np.arange(record.samples) / record.fs
+        assert np.abs(joined(record) - np.c_[np.sin(at), np.cos(1.3 * at)]).max() < 2e-3
+        (note,) = [note for note in data.notes if "even times of" in note]
+        assert "the time column 't' is not evenly spaced: its steps go from" in note
+    assert record.valid is not None  # nothing was measured where samples are lost
+    assert 3 <= (~record.valid).sum() <= 5
+
+
+def test_a_rate_behind_the_file_is_that_of_the_record(tmp_path):
+    path = smooth(tmp_path / "a.csv", np.arange(900) / 100)
+    uses: list[dict[str, Any]] = [BARE, TIMED, BARE | {"fs": 100.0}]
+    for use in uses:
+        data = load_records(f"{path}#25Hz", **use, test="all")
+        assert (data.tests[0].fs, data.tests[0].samples, data.name) == (25.0, 225, "a_25Hz")
+        assert np.allclose(joined(data.tests[0]), joined(load_records(path, **use,
+                           test="all").tests[0])[::4], atol=1e-12)  # fmt: skip
+        assert any("interpolated to even times of 25 Hz" in note for note in data.notes)
+    write(path, np.random.default_rng(0).normal(size=(300, 2)), "u,y")
+    assert load_records(f"{path}#0.5kHz", **BARE, fs=1e3, test="all").tests[0].samples == 150
+
+
+def test_rounded_and_odd_stamps_keep_their_samples(tmp_path):
+    path, k = tmp_path / "a.csv", np.arange(300)
+    for t, fs, rows in (
+        (np.floor(k / 4), 4.0, k),
+        (np.floor(k * 0.05 / 0.135) * 0.135, 20.0, k),  # ticks of a coarse clock
+        (np.r_[0, 0.003 + k[:-1] / 50], 50.0, k[1:]),
+        (np.r_[0, 3 + k[:-1] / 50], 50.0, k[1:]),
+        (np.sort(np.r_[k[:-1], 100]) / 50, 50.0, np.delete(k, 101)),
+    ):
+        values = timed(path, t)
+        data = load_records(path, **TIMED, test="all")
+        assert data.tests[0].fs == pytest.approx(fs, rel=0.01)
+        assert np.array_equal(joined(data.tests[0]), values[rows])
+        assert len(data.notes) == (len(rows) < 300 and t[1] < 1)
 
 
 def test_no_sampling_frequency(tmp_path):
@@ -372,7 +422,9 @@ def test_no_sampling_frequency(tmp_path):
     count = np.arange(300.0)[:, None]
     both = np.hstack([count, count / 20, np.cos(count), np.sin(count)])
     write(path, both, "n,x,u,y")
-    refused(r"fs=HZ, or by a column of time stamps: time='x' \(20 Hz\)", path, use=BARE)
+    data = load_records(path, **BARE)
+    assert data.train[0].fs == 20.0
+    assert data.notes[0] == "the column 'x' is taken for the time, 20 Hz"
     write(path, both[:, [0, 2, 3]], "n,u,y")
     refused(r"is not known; give fs=HZ\.$", path, use=BARE)
     write(path, both[:, [3, 2, 3]], "t,u,y")
@@ -389,8 +441,8 @@ def test_a_column_that_is_named_as_time_is_the_time(tmp_path):
     assert data.train[0].fs == 20.0
     assert data.notes[0] == "the column 'Time' is taken for the time, 20 Hz"
     assert load_records(path, **BARE, fs=20).notes == ()
-    write(path, np.delete(both, [100, 101], axis=0), "n,v,Time [ms],u,y")
-    refused(r"1 gap\(s\) of 2 sample\(s\)", path, use=BARE)
+    write(path, np.delete(both, range(100, 106), axis=0), "n,v,Time [ms],u,y")
+    refused(r"1 gap\(s\) of 6 sample\(s\)", path, use=BARE)
     write(path, both[:, [0, 2, 3, 4]], "t,Time [ms],u,y")
     refused("'t' says 1 Hz and the column 'Time' 20 Hz; give the right one", path, use=BARE)
     assert load_records(path, **BARE, time="Time").train[0].fs == 20.0
@@ -455,8 +507,9 @@ def test_rows_that_are_lost_are_refused_if_the_rate_is_given_too(tmp_path):
     data = load_records(tmp_path / "lost.csv", **use, gaps="split")
     assert [r.samples for r in data.train] == [400, *[393] * 5, 593]
     assert np.array_equal(joined(data.train[-1]), values[-593:])
-    refused(r"1 time stamp\(s\) twice, the first 15 s, at line 1503; leave out one",
-            tmp_path / "doubled.csv", use=use)  # fmt: skip
+    data = load_records(tmp_path / "doubled.csv", **use)
+    assert np.array_equal(joined(data.train[0]), values)
+    assert "has 1 time stamp(s) twice, the first 15 s, at line 1503" in data.notes[0]
     assert load_records(tmp_path / "whole.csv", **use).notes == ()
     refused(r"6 gap\(s\) of 42", tmp_path / "lost.csv", use=use | {"fs": 1e-1})  # if in ms
     use["fs"] = 77.0
@@ -464,20 +517,15 @@ def test_rows_that_are_lost_are_refused_if_the_rate_is_given_too(tmp_path):
     assert message.startswith("fs is 77 Hz and the column 't' says 100 Hz")
 
 
-def test_uneven_time_beside_a_rate_that_is_given_is_noted(tmp_path):
+def test_a_column_beside_a_rate_that_is_given_may_be_no_time(tmp_path):
     path, t = tmp_path / "a.csv", np.arange(300) / 100
     use: dict[str, Any] = BARE | {"fs": 100.0}
-    timed(path, t + 0.003 * np.sin(np.arange(300.0) ** 2))
-    (note,) = load_records(path, **use).notes
-    assert note.startswith("the column 't' is not evenly spaced")
-    assert "samples are lost or doubled unless it is wrong" in note
     timed(path, np.random.default_rng(0).normal(size=300))  # some other t
     assert load_records(path, **use).notes == ()
     table = np.column_stack([t, timed(path, t)])
     table[299, 0] = np.nan  # as a row of means has none
     write(path, table, "t,u,y")
-    (note,) = load_records(path, **use).notes
-    assert note == "the column 't' has no value in 1 sample(s), the first at line 301"
+    assert load_records(path, **use).notes == ()
 
 
 def test_a_unit_of_time_that_is_assumed_is_said(tmp_path):
@@ -509,6 +557,85 @@ def test_sheets_are_records(tmp_path, signals):
     assert any("the sheet 'Run 1' is read" in note for note in load_records(path, **use).notes)
 
 
+# --- runs in one file -----------------------------------------------------------------------
+
+
+def runs_of(path, header: str, names: str, *, timed: bool):
+    """Runs one below another; inputs and outputs of each."""
+    values = [np.random.default_rng(n).normal(size=(n, 2)) for n in (200, 150, 120)]
+    lines = [header]
+    for name, each in zip(names, values, strict=True):
+        for k, (u, y) in enumerate(each.tolist()):
+            lines.append(",".join([name, *[repr(k / 50)] * timed, repr(u), repr(y)]))
+    path.write_text("\n".join(lines) + "\n")
+    return values
+
+
+@pytest.mark.parametrize(
+    ("header", "fs", "names"),
+    [
+        ("run,t,u,y", None, "123"),
+        ("Trial ID,t,u,y", None, "bc2"),
+        ("test,u,y", 50.0, "123"),
+        ("file,u,y", 50.0, "b.c"),
+        ("gear,t,u,y", None, "123"),  # the time tells
+    ],
+)
+def test_runs_in_one_file_are_records(tmp_path, header, fs, names):
+    path = tmp_path / "rig.csv"
+    values = runs_of(path, header, names, timed=fs is None)
+    use: dict[str, Any] = BARE | {"fs": fs}
+    data = load_records(path, **use, test="all")
+    assert [record.name for record in data.tests] == [f"rig_{name}" for name in names]
+    for record, each in zip(data.tests, values, strict=True):
+        assert np.array_equal(joined(record), each)
+        assert (record.fs, record.start) == (50.0, "zero")
+    (note,) = [note for note in data.notes if "runs" in note]
+    assert ": a record each" in note
+    cut = load_records(path, **use, validation=0.2, test=0.2)
+    assert [len(part) for part in (cut.train, cut.validation, cut.tests)] == [3, 3, 3]
+    frames = [pd.DataFrame(each, columns=["u", "y"]) for each in values]
+    own = load_records(frames, **BARE, fs=50.0, validation=0.2, test=0.2)
+    assert [r.samples for r in cut.train] == [r.samples for r in own.train]
+    one = load_records(path, **use, test=f"rig_{names[1]}", validation=0)
+    assert np.array_equal(joined(one.tests[0]), values[1])
+
+
+def test_no_runs_are_guessed(tmp_path):
+    path = tmp_path / "a.csv"
+    u, y = np.random.default_rng(0).normal(size=(2, 400))
+    for header, column in (
+        ("gear,u,y", np.repeat([1, 2], 200)),  # no name of a run, and no time
+        ("run,u,y", np.repeat([1, 2, 1, 2], 100)),  # not in one stretch each
+        ("id,u,y", np.arange(400)),
+        ("run,u,y", np.ones(400)),
+        ("test,u,y", np.repeat(np.random.default_rng(1).normal(size=2), 200)),
+    ):
+        write(path, np.column_stack([column, u, y]), header)
+        assert [r.samples for r in load_records(path, **BARE, fs=1.0, test="all").tests] == [400]
+    write(path, np.column_stack([np.repeat([1, 2], 200), u, y]), "run,u,y")
+    data = load_records(path, inputs=["run", "u"], outputs="y", fs=1.0, test="all", start="zero")
+    assert len(data.tests) == 1
+
+
+def test_runs_may_have_gaps_and_end_early(tmp_path):
+    path, rng = tmp_path / "rig.csv", np.random.default_rng(0)
+    t = [np.arange(200) / 50, np.delete(np.arange(300), range(100, 110)) / 50, np.arange(5) / 50]
+    table = [np.c_[np.full(len(each), i), each, rng.normal(size=(len(each), 2))]
+             for i, each in enumerate(t)]  # fmt: skip
+    write(path, np.concatenate(table), "run,t,u,y")
+    refused(r"1 gap\(s\) of 10 sample\(s\) in all, the first before line 302", path, use=BARE)
+    data = load_records(path, **BARE, gaps="split", test="all")
+    assert [r.name for r in data.tests] == ["rig_0", "rig_1_1", "rig_1_2"]
+    assert [r.start for r in data.tests] == ["zero", "zero", "estimated"]
+    assert "rig_2: left out, as it is too short" in data.notes
+    other = np.c_[np.full(100, 3), np.arange(100) / 25, rng.normal(size=(100, 2))]
+    write(path, np.concatenate([table[0], other]), "run,t,u,y")
+    refused("run 3 is sampled at 25 Hz and the longest at 50 Hz; 'rig.csv#50Hz'", path, use=BARE)
+    data = load_records(f"{path}#50Hz", **BARE, test="all")
+    assert [r.samples for r in data.tests] == [200, 199]
+
+
 # --- gaps -----------------------------------------------------------------------------------
 
 
@@ -519,12 +646,33 @@ def test_gaps_are_refused_with_their_place(tmp_path):
     message = refused("10 sample.* in 1 place.*line 52 in column 'y'", path, use=turned)
     assert "gaps='split'" in message
     assert max(map(len, message.replace(str(path), "a.csv").splitlines())) <= 160
-    timed(path, np.delete(np.arange(300), [100, 101, 102, 200]) / 100)
-    refused(r"2 gap\(s\) of 4 sample\(s\) in all, the first before line 102", path, use=TIMED)
+    timed(path, np.delete(np.arange(300), [*range(100, 105), *range(200, 206)]) / 100)
+    refused(r"2 gap\(s\) of 11 sample\(s\) in all, the first before line 102", path, use=TIMED)
     np.savez(tmp_path / "a.npz", u=np.arange(60.0), y=np.where(np.arange(60) == 7, np.nan, 1))
     refused(r"1 sample.*the first at sample 7 \(from 0\) in column 'y'", tmp_path / "a.npz",
             use={"inputs": "y", "outputs": "u", "fs": 1})  # fmt: skip
     refused("gaps is 'skip'", path, use=TIMED, gaps="skip")
+
+
+@pytest.mark.parametrize("lost", [[700], [100, 101, 102, 700]])
+@pytest.mark.parametrize("use", [BARE, BARE | {"fs": 100.0}, TIMED])
+def test_a_few_lost_samples_are_masked_or_split(tmp_path, lost, use):
+    path, t = tmp_path / "a.csv", np.arange(900) / 100
+    values = timed(path, t)
+    kept = np.delete(np.arange(900), lost)
+    write(path, np.column_stack([t, values])[kept], "t,u,y")
+    data = load_records(path, **use, test="all")
+    (record,) = data.tests
+    assert record.valid is not None
+    assert np.array_equal(np.flatnonzero(~record.valid), lost)
+    assert np.array_equal(joined(record)[kept], values[kept])
+    (note,) = [note for note in data.notes if "missing between" in note]
+    assert note.startswith(
+        f"{len(lost)} sample(s) are missing between the others, the first before"
+    )
+    split = load_records(path, **use, test="all", gaps="split")
+    assert sum(record.samples for record in split.tests) == len(kept)
+    assert len(split.tests) == 2 if len(lost) == 1 else 3
 
 
 def test_outputs_without_a_value_are_left_out(tmp_path):
@@ -559,7 +707,7 @@ def test_stretches_between_gaps_are_records(tmp_path):
     data = load_records(path, **TIMED, gaps="split", validation="rig_2", test=1)
     assert [len(r) for r in (data.train, data.validation, data.tests)] == [1, 1, 1]
     assert data.tests[0].samples == 152
-    refused("no stretch between its gaps is long", path, use=TIMED, gaps="split", skip=148)
+    refused("no run or stretch between gaps is long", path, use=TIMED, gaps="split", skip=148)
 
 
 def test_empty_lines_at_the_end_are_no_gap(tmp_path, signals):
@@ -909,11 +1057,11 @@ def test_columns_that_are_not_used_are_looked_at_together(tmp_path, monkeypatch)
     assert len(passes) == 1
 
 
-def test_a_clock_among_columns_of_text_is_suggested(tmp_path):
+def test_a_clock_among_columns_of_text_is_the_time(tmp_path):
     lines = [f"a,{0.01 * i:.2f},b,{i % 7},{i % 5}" for i in range(50)]
     (tmp_path / "a.csv").write_text("\n".join(["x,clock,z,u,y", *lines]))
-    with pytest.raises(ValueError, match=r"time='clock' \(100 Hz\)"):
-        load_records(tmp_path / "a.csv", inputs="u", outputs="y")
+    data = load_records(tmp_path / "a.csv", **BARE)
+    assert data.notes[0] == "the column 'clock' is taken for the time, 100 Hz"
 
 
 def test_a_line_may_have_thousands_of_cells(tmp_path):

@@ -3,14 +3,8 @@
 import numpy as np
 import pytest
 
-from lfrtorch.files.time_stamps import (
-    TwiceError,
-    UnevenError,
-    column_sampling,
-    is_time,
-    sampling,
-    time_unit,
-)
+from lfrtorch._support.sampling import UnevenError, sampling
+from lfrtorch.files.time_stamps import column_sampling, is_time, time_unit
 from lfrtorch.records import Channel
 
 pytestmark = pytest.mark.numeric
@@ -99,6 +93,6 @@ def test_a_stamp_that_is_missing_moves_no_other():
 
 
 def test_stamps_that_stand_twice():
-    with pytest.raises(TwiceError, match=r"has 2 time stamp\(s\) twice, the first 1 s") as found:
+    with pytest.raises(UnevenError, match=r"has 2 time stamp\(s\) twice, the first 1 s") as found:
         sampling(np.sort(np.append(T, [1.0, 3.0])))
     assert found.value.sample == 101
