@@ -20,7 +20,7 @@ from lfrtorch._support import checkpoint
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, reals
 from lfrtorch._support.errors import InputError, brief
-from lfrtorch._support.frames import columns_of, framed, index_rate, is_frame, places_of
+from lfrtorch._support.frames import check_index, columns_of, framed, is_frame, places_of
 from lfrtorch._support.types import Array
 from lfrtorch.data_reach import Cloud, DataReach
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, fixed_entries
@@ -366,7 +366,7 @@ class Model:
 
     def _inputs_of(self, frame: Any) -> Array:
         """The inputs among the columns of a frame."""
-        index_rate(frame, self.fs)
+        check_index(frame, self.fs)
         wanted = [channel.name for channel in self.inputs]
         return columns_of(frame, places_of(frame, wanted, "model's inputs"))
 

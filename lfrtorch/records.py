@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch._support.checks import integer, number, reals
 from lfrtorch._support.errors import InputError, brief
-from lfrtorch._support.frames import columns_of, index_rate, is_frame, places_of
+from lfrtorch._support.frames import columns_of, index_grid, is_frame, places_of
 from lfrtorch._support.headers import names_and_units
 from lfrtorch._support.types import Array, Booleans
 
@@ -176,12 +176,13 @@ class Record:
             inputs, outputs: one or several columns by name; a unit may stand behind it, "force (N)"
                 is also called "force".
             fs: sampling frequency in Hz. Default: from an index of date-times, time differences or
-                seconds.
+                seconds, evenly spaced. If the index is uneven, the signals are interpolated to even
+                times of ``fs``; where a few rows are missing, outputs are not valid.
             options: other arguments of a record.
 
         Raises:
-            ValueError: a column that is not there or has no numbers, inputs without a value, or an
-                index that is no even time.
+            ValueError: a column that is not there or has no numbers, infinite values, inputs
+                without a value, an index that is no even time, or several runs.
 
         Example:
             >>> import pandas as pd
@@ -192,15 +193,24 @@ class Record:
         if not is_frame(frame):
             raise InputError(f"frame is {brief(repr(frame))}; give a pandas DataFrame.")
         channels = [Channel(*each) for each in names_and_units([*map(str, frame.columns)], {})]
-        given: dict[str, Any] = {}
-        signals = []
-        for side, names in (("inputs", inputs), ("outputs", outputs)):
-            places = places_of(frame, [names] if isinstance(names, str) else names, side)
-            given[side] = tuple(channels[i] for i in places)
-            signals.append(columns_of(frame, places))
-        u, y = signals
+        sides = ("inputs", inputs), ("outputs", outputs)
+        places = [places_of(frame, [n] if isinstance(n, str) else n, side) for side, n in sides]
+        u, y = (columns_of(frame, each) for each in places)
+        for each, signals in zip(places, (u, y), strict=True):
+            if np.isinf(signals).any():
+                row, i = np.argwhere(np.isinf(signals))[0]
+                raise InputError(
+                    f"the column {str(frame.columns[each[i]])!r} is infinite in row {row}; correct "
+                    "it, or leave it empty, as NaN."
+                )
+        rate, rows = index_grid(frame, fs, [*places[0], *places[1]])
+        u, y = rows.on_grid(u), np.where(rows.missing()[:, None], np.nan, rows.on_grid(y))
+        given = {
+            side: tuple(channels[i] for i in each)
+            for (side, _), each in zip(sides, places, strict=True)
+        }
         valid = None if np.isfinite(y).all() else np.isfinite(y)
-        return cls(u, y, index_rate(frame, fs), **given, **{"valid": valid, **options})
+        return cls(u, y, rate, **given, **{"valid": valid, **options})
 
     def _measured(self) -> ArrayLike:
         """The output, interpolated where it is not valid."""

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.headers import names_and_units
+from lfrtorch._support.runs import find_runs, is_run
+from lfrtorch._support.sampling import Piece, UnevenError, even_times
 from lfrtorch._support.types import Array
-
-_UNEVEN = 0.4
-"""Of a step, that a time may be off an even grid: stamps are rounded, a lost sample moves half."""
 
 
 def is_frame(value: Any) -> bool:
@@ -36,29 +36,79 @@ def index_times(frame: Any) -> Array | None:
     return index.to_numpy(np.float64) - float(index[0])
 
 
-def index_rate(frame: Any, fs: float | None) -> float:
-    """The sampling frequency in Hz that the index says, checked against the one that is given."""
+def index_grid(frame: Any, fs: float | None, used: Sequence[int] = ()) -> tuple[float, Piece]:
+    """The sampling frequency in Hz, and the places of the rows on a grid of it, by the index.
+
+    With ``fs`` an index that is uneven is put on a grid of that rate. Columns but ``used`` may
+    number runs, which are refused: they are several records.
+    """
+    names = [name for name, _ in names_and_units([*map(str, frame.columns)], {})]
+    labels = {
+        name: _labels(frame.iloc[:, i])
+        for i, name in enumerate(names)
+        if is_run(name) and i not in used
+    }
     t = index_times(frame)
+    runs = find_runs(len(frame), labels, t)
+    if runs.told:
+        raise InputError(
+            f"the frame has {len(runs.starts)} runs, as {runs.told.replace('time', 'index')}; give "
+            "one of them, or load_records(df, inputs=..., outputs=...), which makes a record of "
+            "each."
+        )
     if t is None or len(t) < 2:
         if fs is None:
             raise InputError(
                 "the frame's index is no time; give fs=HZ, or an index of date-times or seconds: "
                 "df.set_index('t')."
             )
-        return fs
-    step = (t[-1] - t[0]) / (len(t) - 1)
-    off = np.abs(t - t[0] - step * np.arange(len(t)))
-    if not step > 0 or not off.max() <= _UNEVEN * step:
-        steps = np.diff(t)
-        odd = int(np.argmax(np.abs(steps - np.median(steps))))
+        return fs, Piece.of(0, len(frame))
+    if not np.isfinite(t).all():
+        row = int(np.argmin(np.isfinite(t)))
+        raise InputError(f"the frame's index has no time in row {row}; leave the row out.")
+    try:
+        even = even_times(t)
+        rate, holes = even.grid.fs, len(even.pieces) > 1
+        off = 0.1 if even.uneven else max(0.01, even.grid.uncertainty)
+        if fs is not None and abs(fs / rate - 1.0) > off:
+            raise InputError(f"fs is {fs:g} Hz and the frame's index says {rate:g} Hz.")
+        if fs is not None and even.uneven:
+            even = even_times(t, fs)
+    except UnevenError as error:
         raise InputError(
-            f"the frame's index is no even time: {steps[odd]:.4g} s before row {odd + 1}, and "
-            f"{np.median(steps):.4g} s usually; resample it, df.resample('10ms').mean(), or "
-            "load_records(df, gaps='split')."
+            f"the frame's index {error}, at row {error.sample}; sort it, df.sort_index(), or give "
+            "the parts before and after as frames of their own."
+        ) from error
+    if holes:
+        raise InputError(
+            f"the frame's index has a gap before row {even.pieces[1].rows[0]}; load_records(df, "
+            "inputs=..., outputs=..., gaps='split') makes a record of each part between gaps."
         )
-    if fs is not None and abs(fs * step - 1.0) > 0.01:
-        raise InputError(f"fs is {fs:g} Hz and the frame's index says {1.0 / step:g} Hz.")
-    return 1.0 / step if fs is None else fs
+    if fs is None and (even.uneven or even.pieces[0].missing().any()):
+        why = even.uneven or f"lacks {even.pieces[0].missing().sum()} sample(s)"
+        raise InputError(
+            f"the frame's index {why}; fs={rate:g} interpolates the signals to even times, and so "
+            "does load_records(df, inputs=..., outputs=...), which says so in its notes."
+        )
+    return rate if fs is None else fs, even.pieces[0]
+
+
+def check_index(frame: Any, fs: float) -> None:
+    """Refuse an index that is no even time at ``fs`` in Hz."""
+    places = index_grid(frame, fs)[1].places
+    if not np.array_equal(places, np.arange(len(frame))):
+        raise InputError(
+            f"the frame's index is no even time; Record.from_frame(df, ..., fs={fs:g}) makes a "
+            "record on even times, which the model simulates."
+        )
+
+
+def _labels(column: Any) -> NDArray[Any]:
+    """Numbers or words that may number runs."""
+    import pandas as pd
+
+    number = pd.api.types.is_numeric_dtype(column.dtype)
+    return column.to_numpy(np.float64, na_value=np.nan) if number else column.astype(str).to_numpy()
 
 
 def places_of(frame: Any, wanted: Sequence[str], side: str) -> list[int]:

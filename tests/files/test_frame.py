@@ -55,7 +55,9 @@ def test_rows_that_only_count_need_a_rate():
 
 
 def test_what_is_wrong_with_a_frame_is_said():
-    with pytest.raises(InputError, match=r"0.22 s before row 200, and 0.02 s usually; resample it"):
+    with pytest.raises(
+        InputError, match=r"index has a gap before row 200; load_records\(df, inputs"
+    ):
         Record.from_frame(frame(index=STAMPS).drop(STAMPS[200:210]), "force", "disp")
     with pytest.raises(InputError, match="the frame has no column 'power', of the inputs; it has"):
         Record.from_frame(frame(index=STAMPS), "power", "disp")
@@ -76,6 +78,57 @@ def test_what_is_wrong_with_a_frame_is_said():
         lfrtorch.Settings(nx=1, max_iter=10)  # pyright: ignore[reportCallIssue]
 
 
+@pytest.mark.parametrize("dates", [False, True])
+def test_an_uneven_index_is_interpolated_to_a_rate_that_is_given(dates: bool):
+    t = np.arange(T) / FS
+    t[1:] += np.random.default_rng(0).uniform(-0.3, 0.3, T - 1) / FS
+    index = pd.Index(t)
+    if dates:
+        index = pd.Timestamp("2026-01-05") + pd.to_timedelta(t, unit="s")
+    some = pd.DataFrame({"u": np.sin(t), "y": np.cos(t)}, index=index)
+    with pytest.raises(InputError, match=r"not evenly spaced.*; fs=50 interpolates the signals to"):
+        Record.from_frame(some, "u", "y")
+    record = Record.from_frame(some, "u", "y", fs=FS)
+    at = np.arange(record.samples) / FS
+    assert np.abs(record.u[:, 0] - np.sin(at)).max() < 1e-3
+    assert record.fs == FS
+    loaded = lfrtorch.load_records(some, inputs="u", outputs="y", test="all")
+    assert "signals are interpolated to even times of 50 Hz" in loaded.notes[1]
+    np.testing.assert_array_equal(loaded.tests[0].u, record.u)
+    np.testing.assert_array_equal(loaded.tests[0].y, record.y)
+    lost = frame(index=STAMPS).drop(STAMPS[[100, 101, 300]])
+    with pytest.raises(InputError, match=r"lacks 3 sample\(s\); fs=50 interpolates"):
+        Record.from_frame(lost, "force", "disp")
+    record = Record.from_frame(lost, "force", "disp", fs=FS)
+    assert record.valid is not None
+    assert np.flatnonzero(~record.valid).tolist() == [100, 101, 300]
+    np.testing.assert_array_equal(record.y[record.valid], np.delete(Y, [100, 101, 300]))
+
+
+def test_infinite_values_are_none():
+    some = frame(index=STAMPS)
+    some.iloc[5, 1] = np.inf
+    with pytest.raises(InputError, match="'disp/mm' is infinite in row 5; correct it, or leave"):
+        Record.from_frame(some, "force", "disp")
+    with pytest.raises(InputError, match="infinite value"):
+        lfrtorch.load_records(some, inputs="force", outputs="disp")
+
+
+def test_runs_in_one_frame_are_records():
+    each = frame(index=pd.Index(np.arange(T) / FS))
+    both = pd.concat([each, each.iloc[:300]])
+    numbered = both.reset_index(drop=True).assign(Run=["one"] * T + ["two"] * 300)
+    for some, told, fs in ((both, "the index begins again", None), (numbered, "'Run' says", FS)):
+        with pytest.raises(InputError, match=rf"has 2 runs, as .*{told}; .*load_records\(df"):
+            Record.from_frame(some, "force", "disp", fs)
+        data = lfrtorch.load_records(some, inputs="force", outputs="disp", fs=fs, test="all")
+        assert [record.samples for record in data.tests] == [T, 300]
+        np.testing.assert_array_equal(data.tests[1].y[:, 0], Y[:300])
+    assert [record.name for record in data.tests] == ["frame_one", "frame_two"]
+    first = Record.from_frame(numbered[numbered.Run == "one"], "force", "disp", FS)
+    np.testing.assert_array_equal(first.y[:, 0], Y)
+
+
 def test_outputs_without_a_value_are_left_out():
     some = frame(index=STAMPS)
     some.iloc[5:9, 1] = np.nan
@@ -94,6 +147,9 @@ def test_a_model_simulates_a_frame():
     np.testing.assert_array_equal(found.to_numpy(), model.simulate(u))
     with pytest.raises(InputError, match="no column 'u1', of the model's inputs"):
         model.simulate(inputs.drop(columns="u1"))
+    jitter = pd.Index(np.arange(T) / FS + 0.006 * np.sin(np.arange(T) ** 2))
+    with pytest.raises(InputError, match=r"no even time; Record.from_frame\(df, ..., fs=50\)"):
+        model.simulate(inputs.set_axis(jitter))
     with pytest.raises(InputError, match="fs is 50 Hz and the frame's index says 25 Hz"):
         model.simulate(inputs.iloc[::2])
 
