@@ -219,15 +219,17 @@ def _gap(
 ) -> ValueError:
     """What is missing, and what to do."""
     empty = np.isnan(values)
-    rows = empty.any(axis=1)
+    rows = np.asarray(empty.any(axis=1))
     said = []
     if rows.any():
         sample = int(np.argmax(rows))
         places = int(np.count_nonzero(np.diff(np.append(False, rows).astype(np.int8)) == 1))
         column = table.headers[columns[int(np.argmax(empty[sample]))]]
+        samples = int(np.argmin(np.append(rows[sample:], False)))
         said.append(
             f"{rows.sum()} sample(s) have missing values, in {places} place(s), the first at "
-            f"{table.where(sample)} in column {column!r}"
+            f"{table.where(sample)} in column {column!r}, for {samples} sample(s)"
+            + (f" ({samples / grid.fs:.3g} s)" if grid.fs else "")
         )
     if grid.holes[0]:
         said.append(grid.gap(table))

@@ -1,8 +1,9 @@
 """Channels that have their own times, as loggers store them, as a table on even clocks.
 
-Channels of one clock are read together. A clock that runs unevenly, as messages do that come over a
-network, is replaced by an even one of its mean rate, and so are clocks of equal rates that began at
-other instants; the channels are interpolated linearly, NaN where they do not run. Channels of
+Channels that are read together are put on one clock. Even stamps that all of them have are that
+clock. Else it is an even one of their mean rate, where all run, and straight lines join their
+samples; where two neighbours are several steps apart, there is a hole without values (NaN). A
+channel that is logged on change is held between its samples and after the last. Channels of
 different rates are refused together, unless the path ends in a rate for all: ``drive.mf4#50Hz``.
 """
 
@@ -10,12 +11,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array
 from lfrtorch.files.table import BLOCK, Table
 
@@ -25,156 +27,242 @@ _UNEVEN = 0.01
 _SAME = 0.01
 """Relative difference of rates that are one."""
 
-_HOLE = 5
-"""Steps without a sample that are a gap, and not what messages do."""
+_HOLE, _RARE = 5, 0.05
+"""Steps without a sample that are a hole, and not what messages do; at most so many of all are."""
 
-_LONG = 0.5
-"""Of the longest time that a channel lasts: one that lasts less does not cut the others."""
+_LIKE, _MOST = 0.2, 0.75
+"""A clock has a rate if so many of its steps are off their median by so much of it at most."""
 
-_RATE = re.compile(r"([0-9.]+)\s*(k?)Hz", re.IGNORECASE)
+_FEW = 10
+"""Samples that are too few to show a rate."""
+
+_SLOWER, _FAR = 2, 20
+"""Times that a channel on change is slower than another one: at least, and without other signs."""
+
+_RATE = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*(k?)Hz", re.IGNORECASE)
 
 
 class Series(NamedTuple):
-    """One channel: times in seconds and values, each (samples,), and its unit."""
+    """One channel: times in seconds and values, each (samples,), its unit, and a note on it."""
 
     t: Array
     values: Array
     unit: str = ""
+    note: str = ""
 
 
-class _Clock(NamedTuple):
-    """Instants, and their mean rate in Hz."""
+@dataclass(frozen=True, eq=False)
+class _Clock:
+    """Instants of samples; a step that is longer than ``hole`` (s) is a hole."""
 
     t: Array
-    fs: float
+    hole: float
+    fs: float  # Hz, the mean between holes
+    group: int  # of clocks of one rate
+    even: bool  # between holes
+
+
+class _Channel(NamedTuple):
+    """The values of a channel at the instants of a clock, which others may have, too."""
+
+    values: Array
+    clock: _Clock
+    note: str
 
 
 class SeriesTable(Table):
-    """Channels by name, with a column of times for each clock."""
+    """Channels by name, with a column of times for each rate; a text says why one is refused."""
 
-    def __init__(self, path: Path, file: Path, found: Mapping[str, Series]) -> None:
+    def __init__(self, path: Path, file: Path, found: Mapping[str, Series | str]) -> None:
         # ``path`` may name a rate behind the file.
-        asked = _asked(str(path)[len(str(file)) + 1 :]) if path != file else None
-        found = {name: _in_order(each) for name, each in found.items() if len(each.t) > 1}
-        if not found:
-            raise InputError(f"'{file}' has no channel of two samples or more.")
-        clocks, of_channel, changed = _clocks([each.t for each in found.values()], asked)
-        self._columns: list[Array] = []
-        self._clock_of: list[int] = []
-        headers, units = [], {}
-        for i, clock in enumerate(clocks):
-            headers.append("time" if i == 0 else f"time_{i + 1}")
-            units[headers[-1]] = "s"
-            self._columns.append(clock.t)
-            self._clock_of.append(i)
-        for (name, each), i in zip(found.items(), of_channel, strict=True):
+        self._asked = _asked(str(path)[len(str(file)) + 1 :]) if path != file else None
+        ordered = {n: s if isinstance(s, str) else _in_order(s) for n, s in found.items()}
+        refused = {name: each for name, each in ordered.items() if isinstance(each, str)}
+        series = {n: s for n, s in ordered.items() if not isinstance(s, str) and len(s.t) > 1}
+        if not series:
+            why = brief("; ".join(f"{name!r} {reason}" for name, reason in refused.items()))
+            raise InputError(
+                f"'{file}' has no channel of two samples or more{f': {why}' if why else ''}."
+            )
+        clocks = _clocks([each.t for each in series.values()], one=self._asked is not None)
+        self._longest = [
+            max((clock for clock in clocks if clock.group == i), key=lambda c: c.t[-1] - c.t[0])
+            for i in range(1 + max(clock.group for clock in clocks))
+        ]
+        headers = ["time", *(f"time_{i + 1}" for i in range(1, len(self._longest)))]
+        units = dict.fromkeys(headers, "s")
+        self._channels: dict[int, _Channel] = {}
+        for (name, each), clock in zip(series.items(), clocks, strict=True):
             header = name if name not in headers else f"channel {name}"
+            self._channels[len(headers)] = _Channel(each.values, clock, each.note)
             headers.append(header)
             units[header] = each.unit
-            on, values = clocks[i].t, each.values
-            if not np.array_equal(each.t, on):
-                values = np.interp(on, each.t, values, left=np.nan, right=np.nan)
-            self._columns.append(values)
-            self._clock_of.append(i)
-        self._clocks = clocks
-        super().__init__(path, headers, units=units, lengths=[len(c) for c in self._columns])
-        if changed:
-            rates = ", ".join(f"{fs:.6g} Hz" for fs in dict.fromkeys(clocks[i].fs for i in changed))
-            self.notes = (f"channels are interpolated to even times of {rates}",)
+        groups = [*range(len(self._longest)), *(clock.group for clock in clocks)]
+        lengths = [len(self._longest[group].t) for group in groups]
+        times = range(len(self._longest))
+        super().__init__(path, headers, units=units, refused=refused, lengths=lengths, clocks=times)
+        self._t = np.empty(0)  # of the samples that were read last
 
     def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
         """See :meth:`Table.blocks`."""
-        first: dict[int, int] = {}
-        for column in columns:
-            first.setdefault(self._clock_of[column], column)
-        if len(first) > 1:
-            said = " and ".join(
-                f"{self.headers[column]!r} at {self._clocks[clock].fs:.6g} Hz"
-                for clock, column in first.items()
-            )
-            slowest = min(self._clocks[clock].fs for clock in first)
+        held = self._held(columns)
+        t = self._t = self._instants(columns, held)
+        parts = []
+        for i in columns:
+            if i in self._channels:
+                self._remark(self._channels[i].note)
+                parts.append((_held if i in held else _joined)(self._channels[i], t))
+            else:
+                parts.append(t)
+        for i in held:
+            self._remark(f"{self.headers[i]!r} is logged on change and held between its samples")
+        for start in range(0, len(t), samples):
+            yield np.column_stack([part[start : start + samples] for part in parts])
+
+    def beside(self, column: int, columns: Sequence[int]) -> bool:
+        """See :meth:`Table.beside`."""
+        held = self._held(columns)
+        first = next(i for i in columns if i not in held)
+        return self._clock(column).group == self._clock(first).group
+
+    def where(self, sample: int) -> str:
+        """The time of a sample, and its number."""
+        return f"{self._t[sample]:.6g} s, {super().where(sample)}"
+
+    def _clock(self, column: int) -> _Clock:
+        return self._channels[column].clock if column in self._channels else self._longest[column]
+
+    def _held(self, columns: Sequence[int]) -> list[int]:
+        """Those of some columns that are logged on change, as the stamps of the others show."""
+        channels = [i for i in columns if i in self._channels]
+        fastest = max(map(self._clock, channels), key=lambda clock: clock.fs, default=None)
+        return [i for i in channels if fastest and _on_change(self._channels[i], fastest)]
+
+    def _instants(self, columns: Sequence[int], held: Sequence[int]) -> Array:
+        """The samples of columns that are not held, where all of these run and the held have begun.
+
+        Times beside channels are theirs, and alone those of their longest channel.
+        """
+        measured = [i for i in columns if i in self._channels] or columns
+        running = [i for i in measured if i not in held]
+        last = max(measured, key=lambda i: self._clock(i).t[0])
+        first = min(running, key=lambda i: self._clock(i).t[-1])
+        begin, end = self._clock(last).t[0], self._clock(first).t[-1]
+        if begin >= end:
             raise InputError(
-                f"'{self.path}' has {said}; for one clock write '{self.path.name}#{slowest:.3g}Hz'."
+                f"'{self.path}': {self.headers[first]!r} ends at {end:.6g} s and "
+                f"{self.headers[last]!r} begins at {begin:.6g} s: they have no time in common; "
+                "name channels that were measured together."
             )
-        T = len(self._columns[columns[0]]) if columns else 0
-        for begin in range(0, T, samples):
-            part = slice(begin, begin + samples)
-            yield np.column_stack([self._columns[column][part] for column in columns])
+        rates = {self._clock(i).group: i for i in columns if i not in held}
+        if len(rates) > 1:
+            said = " and ".join(
+                f"{self.headers[i]!r} at {self._clock(i).fs:.6g} Hz" for i in rates.values()
+            )
+            slowest = float(f"{min(self._clock(i).fs for i in rates.values()):.3g}")
+            raise InputError(
+                f"'{self.path}' has {said}; for one clock write '{self.path.name}#{slowest:.9g}Hz'."
+            )
+        clocks = {self._clock(i) for i in running}
+        clock = self._clock(running[0])
+        outside = max(self._clock(i).t[-1] for i in running) - end
+        outside += begin - min(self._clock(i).t[0] for i in measured)
+        if outside > clock.hole:
+            self._remark(
+                f"the channels run together from {begin:.6g} s to {end:.6g} s only: the rest is "
+                "left out"
+            )
+        if self._asked is None and len(clocks) == 1 and clock.even:
+            return clock.t[clock.t >= begin - _UNEVEN / clock.fs]
+        fs = self._asked or float(f"{clock.fs:.3g}")  # any rate will do, so a round one
+        self._remark(f"channels are interpolated to even times of {fs:.6g} Hz")
+        T = int((end - begin) * fs + 1e-6) + 1
+        self.check_memory(T * len(columns))
+        return begin + np.arange(T) / fs
+
+    def _remark(self, note: str) -> None:
+        if note and note not in self.notes:
+            self.notes = (*self.notes, note)
 
 
 def _asked(text: str) -> float:
     """The rate that stands behind a file."""
     found = _RATE.fullmatch(text.strip())
-    if found is None or not float(found[1]) > 0:
+    if found is None or not 0 < float(found[1]) < np.inf:
         raise InputError(f"'#{text}' behind the file is no rate; write #50Hz, for example.")
     return float(found[1]) * (1000.0 if found[2] else 1.0)
 
 
-def _in_order(series: Series) -> Series:
-    """A channel without values that are none, in the order of time."""
+def _in_order(series: Series) -> Series | str:
+    """A channel without values that have no time, in its order; or why there is no such order."""
     t, values = (np.asarray(part, dtype=np.float64) for part in series[:2])
     kept = np.isfinite(t)
     t, values = t[kept], values[kept]
     if (np.diff(t) <= 0).any():
+        # Messages overtake one another by a few steps.
+        late = np.maximum.accumulate(t) - t > _HOLE * np.ptp(t) / (len(t) - 1)
+        if late.any():
+            k = int(np.argmax(late))
+            return (
+                f"has a clock that is set back, from {t[k - 1]:.10g} s to {t[k]:.10g} s after {k} "
+                "samples; give the parts before and after that apart"
+            )
         t, first = np.unique(t, return_index=True)
         values = values[first]
-    return Series(t, values, series.unit)
+    return series._replace(t=t, values=values)
 
 
-def _clocks(
-    times: Sequence[Array], asked: float | None
-) -> tuple[list[_Clock], list[int], list[int]]:
-    """The clocks, that of each channel, and those that channels are interpolated to."""
-    if asked is not None:
-        longest = max(t[-1] - t[0] for t in times)
-        long = [t for t in times if t[-1] - t[0] >= _LONG * longest]
-        return [_Clock(_common(long, asked), asked)], [0] * len(times), [0]
-    own: list[Array] = []
-    number: list[int] = []
+def _clocks(times: Sequence[Array], *, one: bool) -> list[_Clock]:
+    """The clock of each channel; those of one rate are a group, or all."""
+    own: list[_Clock] = []
+    found = []
     for t in times:
-        known = (i for i, other in enumerate(own) if np.array_equal(t, other))
-        found = next(known, len(own))
-        own += [t] if found == len(own) else []
-        number.append(found)
-    groups: list[list[int]] = []
-    rates = [(len(t) - 1) / (t[-1] - t[0]) for t in own]
-    whole = [_gapless(t, fs) for t, fs in zip(own, rates, strict=True)]
-    for i, fs in enumerate(rates):
-        near = (g for g in groups if abs(rates[g[0]] / fs - 1) < _SAME and whole[i] and whole[g[0]])
-        group = next((g for g in near if _together(own[i], own[g[0]])), None)
-        if group is None:
-            groups.append([i])
-        else:
-            group.append(i)
-    clocks, changed, place = list[_Clock](), list[int](), dict[int, int]()
-    for number_of_group, group in enumerate(groups):
-        first = own[group[0]]
-        fs = rates[group[0]]
-        even = np.abs(first - first[0] - np.arange(len(first)) / fs).max() <= _UNEVEN / fs
-        if len(group) == 1 and (even or not whole[group[0]]):
-            clocks.append(_Clock(first, fs))
-        else:
-            fs = float(f"{fs:.3g}")  # any rate will do, so a round one
-            clocks.append(_Clock(_common([own[i] for i in group], fs), fs))
-            changed.append(number_of_group)
-        place |= dict.fromkeys(group, number_of_group)
-    return clocks, [place[i] for i in number], changed
+        clock = next((known for known in own if np.array_equal(t, known.t)), None)
+        if clock is None:
+            steps = np.diff(t)
+            hole = _HOLE * float(np.quantile(steps, 1 - _RARE, method="lower"))
+            fs = 1 / float(steps[steps <= hole].mean())
+            near = (known.group for known in own if one or abs(known.fs / fs - 1) < _SAME)
+            group = next(near, 1 + max((known.group for known in own), default=-1))
+            own.append(clock := _Clock(t, hole, fs, group, _even(t, fs, hole)))
+        found.append(clock)
+    return found
 
 
-def _common(times: Sequence[Array], fs: float) -> Array:
-    """An even grid where all of the clocks run."""
-    low, high = max(t[0] for t in times), min(t[-1] for t in times)
-    if not (high - low) * fs >= 1.0:
-        raise InputError("the channels have no common stretch of time; give their files apart.")
-    return low + np.arange(int((high - low) * fs + 1e-6) + 1) / fs
+def _even(t: Array, fs: float, hole: float) -> bool:
+    """Whether a clock runs evenly between holes."""
+    holes = np.flatnonzero(np.diff(t) > hole) + 1
+    off = np.split(t - np.arange(len(t)) / fs, holes)
+    return all(np.abs(part - part[0]).max() <= _UNEVEN / fs for part in off)
 
 
-def _together(t: Array, other: Array) -> bool:
-    """Whether two clocks run at the same time for the most part."""
-    common = min(t[-1], other[-1]) - max(t[0], other[0])
-    return bool(common >= _LONG * max(t[-1] - t[0], other[-1] - other[0]))
+def _on_change(channel: _Channel, fastest: _Clock) -> bool:
+    """Whether a channel is logged when it changes: at no rate, and more seldom than another one."""
+    t, fs = channel.clock.t, channel.clock.fs
+    steps = np.diff(t)
+    like = np.abs(steps / np.median(steps) - 1) <= _LIKE
+    if (like.mean() >= _MOST and len(t) >= _FEW) or _SLOWER * fs > fastest.fs:
+        return False
+    place = np.searchsorted(fastest.t, t - _UNEVEN / fastest.fs).clip(max=len(fastest.t) - 1)
+    beside = np.abs(fastest.t[place] - t) <= _UNEVEN / fastest.fs  # logged by the same task
+    levels = len(np.unique(channel.values))
+    return bool(_FAR * fs <= fastest.fs or beside.mean() >= _MOST or 2 * levels <= len(t))
 
 
-def _gapless(t: Array, fs: float) -> bool:
-    """Whether no stretch of several steps is without a sample."""
-    return bool(np.diff(t).max() * fs < _HOLE)
+def _held(channel: _Channel, t: Array) -> Array:
+    """The last value at each instant; no instant is before the first value."""
+    step = t[1] - t[0] if len(t) > 1 else 0.0
+    return channel.values[np.searchsorted(channel.clock.t, t + _UNEVEN * step, "right") - 1]
+
+
+def _joined(channel: _Channel, t: Array) -> Array:
+    """Straight lines between values, NaN in holes."""
+    own = channel.clock.t
+    if np.array_equal(own, t):
+        return channel.values
+    values = np.interp(t, own, channel.values, left=np.nan, right=np.nan)
+    after = np.searchsorted(own, t).clip(1, len(own) - 1)
+    before, after = own[after - 1], own[after]
+    inside = np.minimum(t - before, after - t) > _UNEVEN / channel.clock.fs
+    values[inside & (after - before > channel.clock.hole)] = np.nan
+    return values

@@ -129,6 +129,10 @@ class Table(ABC):
         if words and note not in self.notes:
             self.notes = (*self.notes, note)
 
+    def beside(self, column: int, columns: Sequence[int]) -> bool:
+        """Whether a column can be read with others."""
+        return not self.lengths or self.lengths[column] == self.lengths[columns[0]]
+
     def where(self, sample: int) -> str:
         """What a user finds the sample by."""
         return f"sample {sample} (from 0)"

@@ -162,13 +162,13 @@ def _columns(
     table: Table, used: Sequence[int], *, named: bool
 ) -> tuple[list[_Found], list[tuple[int, UnevenError]]]:
     """Find times among the columns that are not measured, and why others are none."""
-    lengths = table.lengths
-    usual = lengths[used[0]] if lengths and used else max(lengths, key=lengths.count, default=0)
+    usual = max(table.lengths, key=table.lengths.count, default=0)
+    with_them = used or [i for i, length in enumerate(table.lengths) if length == usual][:1]
     left = [
         column
         for column, channel in enumerate(table.columns)
         if column not in used
-        and not (lengths and lengths[column] != usual)
+        and (not with_them or table.beside(column, with_them))
         and (not named or is_time(channel) or column in table.clocks)
     ]
     reasons: dict[int, UnevenError] = {}

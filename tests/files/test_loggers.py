@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from lfrtorch import InputError, load_records
+from lfrtorch.dataset import Dataset
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.series import Series, SeriesTable
 
@@ -185,7 +186,7 @@ def test_damaged_files_and_missing_packages(tmp_path: Path, monkeypatch, name: s
         open_table(tmp_path / name)
 
 
-def test_a_channel_that_lasts_a_short_time_does_not_cut_the_others():
+def test_only_channels_that_are_read_cut_one_another():
     found = {
         "u": Series(TIMES, U),
         "y": Series(TIMES + 1e-3, Y),
@@ -196,12 +197,15 @@ def test_a_channel_that_lasts_a_short_time_does_not_cut_the_others():
     u, y, event, time = (table.find(n, "inputs")[0] for n in ("u", "y", "event", "channel time"))
     (block,) = table.blocks([u, y, time])
     assert len(block) == T - 1
-    with pytest.raises(InputError, match=r"for one clock write 'a\.mf4#100Hz'"):
-        next(table.blocks([u, event]))
+    assert not any("left out" in note for note in table.notes)
     slow = SeriesTable(Path("a.mf4#50Hz"), Path("a.mf4"), found)
-    (block,) = slow.blocks([slow.find(n, "inputs")[0] for n in ("u", "event")])
-    assert len(block) == T // 2
-    assert np.isfinite(block).sum(axis=0).tolist() == [T // 2, 19]
+    for each, samples in ((table, 40), (slow, 20)):
+        (block,) = each.blocks([u, event] if each is table else [1, 3])
+        assert len(block) == samples
+        assert np.isfinite(block).all()
+        assert "the channels run together from 3.002 s to 3.392 s only: the rest is left out" in (
+            each.notes
+        )
 
 
 def test_gaps_stay_gaps():
@@ -210,3 +214,153 @@ def test_gaps_stay_gaps():
     (block,) = table.blocks([0, 1, 2])
     np.testing.assert_array_equal(block, np.column_stack([t, t, 2 * t]))
     assert not table.notes
+
+
+def mf4(path: Path, **channels: tuple[np.ndarray, np.ndarray]) -> Path:
+    """A file in which every channel, of times and values, has a clock of its own."""
+    with asammdf.MDF(version="4.10") as file:
+        for name, (t, values) in channels.items():
+            file.append([asammdf.Signal(values, t, name=name)])
+        file.save(path, overwrite=True)
+    return path
+
+
+def all_of(path: Path | str, **options: Any) -> Dataset:
+    return load_records(path, inputs="u", outputs="y", start="zero", test="all", **options)
+
+
+HOLE = np.delete(np.arange(T), slice(200, 350))
+
+
+@pytest.mark.parametrize("rate", ["", "#100Hz", "#80Hz"])
+def test_a_hole_in_a_channel_is_not_filled(tmp_path: Path, rate: str):
+    wave = np.sin(7 * TIMES)
+    path = f"{mf4(tmp_path / 'a.mf4', u=(TIMES[HOLE], wave[HOLE]), y=(TIMES, Y))}{rate}"
+    with pytest.raises(InputError, match=r"the first at 2 s.* 'u', for .* \(1.5 s\).\n.*'split'"):
+        all_of(path)
+    records = all_of(path, gaps="split").tests
+    assert sum(record.samples for record in records) / records[0].fs == pytest.approx(4.5)
+    for record, begin in zip(records, (0.0, 3.5), strict=True):
+        t = begin + np.arange(record.samples) / record.fs
+        np.testing.assert_allclose(record.u[:, 0], np.sin(7 * t), atol=1e-3)  # (7 / 100)² / 8
+
+
+@pytest.mark.parametrize("rate", ["", "#100Hz"])
+def test_a_hole_in_an_output_is_simulated_through(tmp_path: Path, rate: str):
+    path = mf4(tmp_path / "a.mf4", u=(TIMES, U), y=(TIMES[HOLE], Y[HOLE]))
+    data = all_of(f"{path}{rate}")
+    (record,) = data.tests
+    assert record.valid is not None
+    np.testing.assert_array_equal(np.flatnonzero(~record.valid[:, 0]), np.arange(200, 350))
+    np.testing.assert_array_equal(record.u[:, 0], U)
+    assert any("150 output sample(s) have no value, the first at 2 s" in n for n in data.notes)
+
+
+def test_a_hole_in_jittering_messages_of_one_topic_is_a_hole():
+    t = (TIMES + np.random.default_rng(1).uniform(-2e-3, 2e-3, T))[HOLE]
+    table = SeriesTable(Path("a"), Path("a"), {"u": Series(t, t), "y": Series(t, 2 * t)})
+    (block,) = table.blocks([0, 1, 2])
+    missing = np.isnan(block).any(axis=1)
+    assert 148 <= missing.sum() <= 151
+    np.testing.assert_allclose(block[~missing], block[~missing, :1] * [1, 1, 2], atol=1e-9)
+
+
+@pytest.mark.parametrize("rate", ["", "#100Hz"])
+def test_channels_of_different_times_are_refused(tmp_path: Path, rate: str):
+    path = mf4(tmp_path / "a.mf4", u=(TIMES, U), y=(TIMES + 7, Y))
+    with pytest.raises(InputError, match=r"'u' ends at 5\.99 s and 'y' begins at 7 s") as error:
+        all_of(f"{path}{rate}")
+    assert "Hz" not in str(error.value).replace("#100Hz'", "")
+
+
+def on_change() -> tuple[np.ndarray, np.ndarray]:
+    """Samples of a command at which it changes, the last one second before the end."""
+    dwell = np.random.default_rng(2).integers(3, 40, size=100)
+    at = np.concatenate([[0], np.cumsum(dwell)])
+    at = at[at < T - 100]
+    return at, np.random.default_rng(3).choice([0.0, 1.0, 3.0], size=len(at))
+
+
+@pytest.mark.parametrize("rate", ["", "#100Hz"])
+def test_a_channel_on_change_is_held_to_the_end(tmp_path: Path, rate: str):
+    at, levels = on_change()
+    path = mf4(tmp_path / "a.mf4", u=(TIMES[at], levels), y=(TIMES, Y))
+    data = all_of(f"{path}{rate}")
+    (record,) = data.tests
+    np.testing.assert_array_equal(record.u[:, 0], np.repeat(levels, np.diff(at, append=T)))
+    assert record.fs == pytest.approx(FS)
+    assert "'u' is logged on change and held between its samples" in data.notes
+
+
+@pytest.mark.parametrize("levels", [[0.0, 1.0], [0.0, 2.0, 1.0, 3.0]])
+def test_a_step_of_few_samples_is_held(tmp_path: Path, levels: list[float]):
+    at = 100 * np.arange(len(levels))
+    path = mf4(tmp_path / "a.mf4", u=(TIMES[at], np.array(levels)), y=(TIMES, Y))
+    (record,) = all_of(path).tests
+    np.testing.assert_array_equal(record.u[:, 0], np.repeat(levels, np.diff(at, append=T)))
+
+
+def test_a_record_begins_with_the_first_value_of_what_is_held(tmp_path: Path):
+    at, levels = on_change()
+    path = mf4(tmp_path / "a.mf4", u=(TIMES[at[1:]], levels[1:]), y=(TIMES, Y))
+    data = all_of(path)
+    (record,) = data.tests
+    np.testing.assert_array_equal(record.y[:, 0], Y[at[1] :])
+    assert record.u[0, 0] == levels[1]
+    assert any(f"run together from {TIMES[at[1]]:g} s" in note for note in data.notes)
+
+
+def test_slow_messages_with_jitter_or_lost_ones_are_not_held():
+    generator = np.random.default_rng(4)
+    jitter = np.arange(0, 6, 0.1) + generator.uniform(-0.02, 0.02, 60)
+    lost = np.sort(generator.choice(TIMES[::10], 50, replace=False))
+    hole = np.delete(TIMES[::10], slice(20, 40))
+    for t in (jitter, lost, hole):
+        table = SeriesTable(Path("a"), Path("a"), {"u": Series(t, t), "y": Series(TIMES, Y)})
+        u, y = (table.find(name, "inputs")[0] for name in "uy")
+        with pytest.raises(InputError, match=r"'u' at .* Hz and 'y' at 100 Hz; for one clock"):
+            next(table.blocks([u, y]))
+        table = SeriesTable(Path("a#100Hz"), Path("a"), {"u": Series(t, t), "y": Series(TIMES, Y)})
+        (block,) = table.blocks([0, 1])
+        joined = block[np.isfinite(block[:, 1])]
+        np.testing.assert_allclose(joined[:, 1], joined[:, 0], atol=1e-9)
+        # The hole is from 1.9 to 4 s.
+        assert np.isnan(block[:, 1]).sum() == (209 if t is hole else 0)
+
+
+def test_a_channel_without_another_beside_it_is_not_held():
+    at, levels = on_change()
+    found = {"u": Series(TIMES[at], levels), "y": Series(TIMES[at], 2 * levels)}
+    table = SeriesTable(Path("a#100Hz"), Path("a"), found)
+    (block,) = table.blocks([1, 2])
+    np.testing.assert_allclose(block[:, 1], 2 * block[:, 0])
+    assert not any("held" in note for note in table.notes)
+
+
+def test_the_times_of_any_rate_are_found(tmp_path: Path):
+    path = mf4(tmp_path / "a.mf4", slow=(TIMES[::10], Y[::10]), u=(TIMES, U), y=(TIMES, Y))
+    assert all_of(path).tests[0].fs == pytest.approx(FS)
+
+
+def test_a_clock_that_is_set_back_is_named(tmp_path: Path):
+    back = np.where(TIMES < 3, TIMES, TIMES - 1.5)
+    path = mf4(tmp_path / "a.mf4", u=(back, U), y=(back, Y), other=(TIMES, U), more=(TIMES, Y))
+    with pytest.raises(InputError, match=r"clock that is set back, from 2.99 s to 1.5 s after 300"):
+        all_of(path)
+    load_records(path, inputs="other", outputs="more", start="zero", test="all")
+    late = np.arange(T)
+    late[[100, 101]] = [101, 100]  # messages overtake one another
+    path = mf4(tmp_path / "b.mf4", u=(TIMES[late], U[late]), y=(TIMES, Y))
+    np.testing.assert_array_equal(all_of(path).tests[0].u[:, 0], U)
+
+
+def test_rates_in_messages_are_rates_behind_files(tmp_path: Path):
+    k = np.arange(T)
+    path = mf4(tmp_path / "a.mf4", u=(k / 51200, U), y=(k[:-1] / 102400, Y[:-1]))
+    with pytest.raises(InputError, match=r"for one clock write 'a\.mf4#51200Hz'"):
+        all_of(path)
+    for rate in ("51200Hz", "5.12e4Hz", "5.12E+04 Hz", "51.2kHz"):
+        assert all_of(f"{path}#{rate}").tests[0].fs == pytest.approx(51200)
+    for rate in ("1.2.3Hz", "0Hz", "1e999Hz", "eHz", ".Hz"):
+        with pytest.raises(InputError, match="is no rate"):
+            all_of(f"{path}#{rate}")
