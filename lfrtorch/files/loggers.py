@@ -15,13 +15,15 @@ from lfrtorch._support.errors import InputError, brief
 from lfrtorch.files.arrays import optional
 from lfrtorch.files.series import Series, SeriesTable
 from lfrtorch.files.table import Table
+from lfrtorch.files.time_stamps import is_time, time_unit
+from lfrtorch.records import Channel
 
 _LONGEST = 16
 """Entries of an array in a message that are channels."""
 
 _NANOSECONDS = 1e-9
 
-Read = Callable[[Path], Mapping[str, Series]]
+Read = Callable[[Path], Mapping[str, Series | str]]
 
 
 def _reader(read: Read, kind: str) -> Callable[[Path], Table]:
@@ -47,41 +49,77 @@ def _mdf(path: Path) -> dict[str, Series]:
     asammdf = optional("asammdf")
     found: dict[str, Series] = {}
     with asammdf.MDF(str(path)) as file:
-        for number, signal in enumerate(file.iter_channels()):
-            if signal.samples.dtype.kind in "biuf" and signal.samples.ndim == 1:
-                own = signal.name if signal.name not in found else f"{signal.name} [{number}]"
-                found[own] = Series(signal.timestamps, signal.samples, signal.unit or "")
+        for number, signal in enumerate(file.iter_channels(raw=True)):
+            name = signal.name if signal.name not in found else f"{signal.name} [{number}]"
+            values, notes = signal.physical(copy=False).samples, []
+            if values.dtype.kind not in "biuf" and signal.samples.dtype.kind in "biuf":
+                values = signal.samples
+                notes.append(f"{name!r} has words for its numbers: the numbers are read")
+            if values.dtype.kind not in "biuf" or values.ndim != 1:
+                continue
+            invalid = signal.invalidation_bits
+            if invalid is not None and np.any(invalid):
+                values = np.where(invalid, np.nan, values)
+                notes.append(f"{np.sum(invalid)} sample(s) of {name!r} are invalid: no values")
+            found[name] = Series(signal.timestamps, values, signal.unit or "", "; ".join(notes))
     return found
 
 
-def _tdms(path: Path) -> dict[str, Series]:
+def _tdms(path: Path) -> dict[str, Series | str]:
     """The channels of all groups, by name, or by group and name if that is not one."""
     nptdms = optional("nptdms")
-    found: dict[str, Series] = {}
+    found: dict[str, Series | str] = {}
     begins: dict[str, int] = {}
     with nptdms.TdmsFile.read(str(path)) as file:
-        channels = [channel for group in file.groups() for channel in group.channels()]
-        names = [channel.name for channel in channels]
-        for channel in channels:
-            if channel.dtype.kind not in "biuf" or not len(channel):
-                continue
-            twice = names.count(channel.name) > 1
-            name = f"{channel.group_name}/{channel.name}" if twice else channel.name
-            told = channel.properties
-            if "wf_increment" not in told:
-                raise InputError(
-                    f"'{path}': the channel {name!r} has no wf_increment, so its times are not "
-                    "known; export it as text, and give fs."
-                )
-            t = told.get("wf_start_offset", 0.0) + told["wf_increment"] * np.arange(len(channel))
-            begins[name] = int(np.datetime64(told.get("wf_start_time", 0), "us").astype(np.int64))
-            unit = str(told.get("unit_string", ""))
-            found[name] = Series(t, channel[:].astype(np.float64), unit)
+        names = [channel.name for group in file.groups() for channel in group.channels()]
+        for group in file.groups():
+            stamps = next(filter(_is_clock, group.channels()), None)
+            for channel in group.channels():
+                if channel.dtype.kind not in "biuf" or not len(channel):
+                    continue
+                twice = names.count(channel.name) > 1
+                name = f"{channel.group_name}/{channel.name}" if twice else channel.name
+                told, note, begin = channel.properties, "", None
+                if told.get("wf_increment", 0) > 0:
+                    t = told["wf_increment"] * np.arange(len(channel))
+                    t += told.get("wf_start_offset", 0.0)
+                    begin = told.get("wf_start_time")
+                    if begin is None:
+                        note = f"{name!r} has no start time: it begins with the first of the others"
+                elif stamps is not None and len(stamps) == len(channel):
+                    note = f"{stamps.name!r} is the time of {channel.group_name!r}"
+                    t = stamps[:]
+                    if stamps.dtype.kind == "M":
+                        begin, t = t[0], (t - t[0]) / np.timedelta64(1, "s")
+                    else:
+                        t = t * time_unit(t, _named(stamps)).seconds
+                else:
+                    found[name] = (
+                        "has neither wf_increment nor a channel of times beside it, so its times "
+                        "are not known; export it as text, and give fs"
+                    )
+                    continue
+                if begin is not None:
+                    begins[name] = int(np.datetime64(begin, "us").astype(np.int64))
+                unit = str(told.get("unit_string", ""))
+                found[name] = Series(t, channel[:].astype(np.float64), unit, note)
     first = min(begins.values(), default=0)  # seconds since 1970 would lose digits
-    return {
-        name: series._replace(t=series.t + 1e-6 * (begins[name] - first))
-        for name, series in found.items()
-    }
+    for name, begin in begins.items():
+        series = found[name]
+        if isinstance(series, Series):
+            found[name] = series._replace(t=series.t + 1e-6 * (begin - first))
+    return found
+
+
+def _named(channel: Any) -> Channel:
+    """Name and unit of a channel of TDMS."""
+    return Channel(channel.name, str(channel.properties.get("unit_string", "")))
+
+
+def _is_clock(channel: Any) -> bool:
+    """Whether a channel of TDMS has time stamps, or is named as time is."""
+    kind = channel.dtype.kind
+    return kind == "M" or (kind in "iuf" and is_time(_named(channel)))
 
 
 def _uff(path: Path) -> dict[str, Series]:
@@ -98,8 +136,9 @@ def _uff(path: Path) -> dict[str, Series]:
         name = label if label not in ("", "NONE") else f"{one['rsp_node']}:{one['rsp_dir']}"
         name = name if name not in found else f"{name} [{number}]"
         unit = str(one.get("ordinate_axis_units_lab", "")).strip()
+        T = int(one["num_pts"])  # zeros may fill the last line
         found[name] = Series(
-            np.asarray(one["x"]), np.asarray(one["data"]), "" if unit == "NONE" else unit
+            np.asarray(one["x"])[:T], np.asarray(one["data"])[:T], "" if unit == "NONE" else unit
         )
     return found
 
@@ -111,7 +150,9 @@ def _mcap(path: Path) -> dict[str, Series]:
     def messages() -> Iterator[tuple[str, int, Any]]:
         stores: dict[int, Callable[[bytes], Any]] = {}
         with path.open("rb") as file:
-            for schema, channel, message in reader.make_reader(file).iter_messages():
+            for schema, channel, message in reader.make_reader(file).iter_messages(
+                log_time_order=False  # else a clock that is set back shuffles them
+            ):
                 if channel.id not in stores:
                     stores[channel.id] = _decoder(schema, channel.message_encoding)
                 yield channel.topic, message.log_time, stores[channel.id](message.data)
@@ -161,7 +202,7 @@ def _fields(messages: Iterable[tuple[str, int, Any]]) -> dict[str, Series]:
             times, values = columns.setdefault(name, ([], []))
             times.append(time)
             values.append(value)
-    first = min((times[0] for times, _ in columns.values()), default=0)
+    first = min((min(times) for times, _ in columns.values()), default=0)
     return {
         name: Series((np.array(times) - first) * _NANOSECONDS, np.array(values))
         for name, (times, values) in columns.items()

@@ -354,6 +354,20 @@ def test_a_clock_that_is_set_back_is_named(tmp_path: Path):
     np.testing.assert_array_equal(all_of(path).tests[0].u[:, 0], U)
 
 
+def test_messages_of_a_clock_that_is_set_back_are_not_shuffled(tmp_path: Path):
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = mcap_writer.Writer(file)
+        writer.start()
+        schema = writer.register_schema("any", "jsonschema", b"{}")
+        topic = writer.register_channel("/rig", "json", schema)
+        for k, t in enumerate(TIMES):
+            stamp = 1_700_000_000_000_000_000 + round((t if t < 3 else t - 1.5) * 1e9)
+            writer.add_message(topic, stamp, json.dumps({"u": U[k], "y": Y[k]}).encode(), stamp)
+        writer.finish()
+    with pytest.raises(InputError, match=r"'rig.u'.* clock that is set back, from 2.99 s to 1.5 s"):
+        load_records(tmp_path / "a.mcap", inputs="rig.u", outputs="rig.y")
+
+
 def test_rates_in_messages_are_rates_behind_files(tmp_path: Path):
     k = np.arange(T)
     path = mf4(tmp_path / "a.mf4", u=(k / 51200, U), y=(k[:-1] / 102400, Y[:-1]))
@@ -364,3 +378,74 @@ def test_rates_in_messages_are_rates_behind_files(tmp_path: Path):
     for rate in ("1.2.3Hz", "0Hz", "1e999Hz", "eHz", ".Hz"):
         with pytest.raises(InputError, match="is no rate"):
             all_of(f"{path}#{rate}")
+
+
+def test_values_of_mdf_that_are_invalid_or_have_words(tmp_path: Path):
+    invalid = np.zeros(T, bool)
+    invalid[200:210] = True
+    gears = (np.arange(T) // 50).astype(np.uint8)
+    words: dict[str, Any] = {f"val_{i}": float(i) for i in range(12)}
+    words |= {f"text_{i}": f"gear {i}".encode() for i in range(12)} | {"default": b"?"}
+    with asammdf.MDF(version="4.10") as file:
+        wrong = np.where(invalid, 1e6, Y)
+        file.append([asammdf.Signal(wrong, TIMES, name="y", invalidation_bits=invalid)])
+        file.append([asammdf.Signal(gears, TIMES, name="u", conversion=words)])
+        half = {"a": 0.5, "b": 1.0}  # a x + b
+        file.append([asammdf.Signal(gears, TIMES, name="scaled", conversion=half)])
+        file.save(tmp_path / "a.mf4")
+    data = load_records(
+        tmp_path / "a.mf4", inputs="u", outputs=["y", "scaled"], start="zero", test="all"
+    )
+    (record,) = data.tests
+    np.testing.assert_array_equal(record.u[:, 0], gears)
+    np.testing.assert_array_equal(record.y[:, 1], 0.5 * gears + 1.0)
+    assert record.valid is not None
+    np.testing.assert_array_equal(~record.valid[:, 0], invalid)
+    np.testing.assert_array_equal(record.y[~invalid, 0], Y[~invalid])
+    assert "10 sample(s) of 'y' are invalid: no values" in data.notes
+    assert "'u' has words for its numbers: the numbers are read" in data.notes
+
+
+STARTED = {"wf_increment": 1 / FS, "wf_start_time": np.datetime64("2026-01-05T08:00:00", "us")}
+STAMPS = STARTED["wf_start_time"] + np.arange(T) * np.timedelta64(10_000, "us")
+
+
+@pytest.mark.parametrize(
+    ("u", "y", "beside", "said"),
+    [
+        (STARTED, STARTED, {"status": np.zeros(3)}, ""),
+        (STARTED, {"wf_increment": 1 / FS}, {}, "'y' has no start time"),
+        ({}, {}, {"Time": TIMES}, "'Time' is the time of 'rig'"),
+        ({}, {}, {"time_ms": 1e3 * TIMES}, "'time_ms' is the time of 'rig'"),
+        ({}, {}, {"Stamp": STAMPS}, "'Stamp' is the time of 'rig'"),
+    ],
+)
+def test_times_of_tdms(tmp_path: Path, u: Any, y: Any, beside: dict[str, Any], said: str):
+    channels = [
+        nptdms.ChannelObject("rig", "u", U, properties=u),
+        nptdms.ChannelObject("rig", "y", Y, properties=y),
+        *(nptdms.ChannelObject("rig", name, values) for name, values in beside.items()),
+    ]
+    with nptdms.TdmsWriter(str(tmp_path / "a.tdms")) as writer:
+        writer.write_segment(channels)
+    data = all_of(tmp_path / "a.tdms")
+    (record,) = data.tests
+    assert record.fs == pytest.approx(FS)
+    np.testing.assert_array_equal(record.u[:, 0], U)
+    np.testing.assert_array_equal(record.y[:, 0], Y)
+    assert any(said in note for note in data.notes)
+    if "status" in beside:
+        with pytest.raises(InputError, match="'status', named in inputs, has neither wf_increment"):
+            load_records(tmp_path / "a.tdms", inputs="status", outputs="y")
+
+
+def test_zeros_that_fill_the_last_line_of_uff_are_no_samples(tmp_path: Path):
+    uff(tmp_path / "a.uff")
+    lines = (tmp_path / "a.uff").read_text().splitlines()
+    ends = [i for i, line in enumerate(lines) if line == "    -1"][1::2]
+    for end in ends:
+        lines[end - 1] += f"{0.0:20.12e}" * (4 - len(lines[end - 1]) // 20)
+        lines[end - 1] = "".join([lines[end - 1], "\n", f"{0.0:20.12e}" * 3])
+    (tmp_path / "a.uff").write_text("\n".join(lines) + "\n")
+    data = load_records(tmp_path / "a.uff", inputs="Torque", outputs="Speed", test="all")
+    assert data.tests[0].samples == T
