@@ -22,7 +22,7 @@ from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.memory import check_memory
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
-from lfrtorch.files.matlab_elements import check_elements
+from lfrtorch.files.matlab_elements import Variable, variables_in
 from lfrtorch.files.table import BLOCK, Clock, Table
 
 _REAL, _TIMES = "biuf", "M"
@@ -268,13 +268,13 @@ def mat(path: Path) -> ArrayTable:
 
     try:
         if scipy_io.matlab.matfile_version(path)[0] == 1:
-            check_elements(path)
-        shapes = [shape for _, shape, _ in scipy_io.whosmat(path)]
-        if any(size < 0 for shape in shapes for size in shape):
-            raise ValueError("an array of negative size")
-        numbers = sum(map(math.prod, shapes))
+            listed = variables_in(path)
+        else:
+            listed = [Variable(n, math.prod(shape)) for n, shape, _ in scipy_io.whosmat(path)]
+        numbers = sum(each.numbers for each in listed)
         check_memory(8.0 * numbers, f"'{path}', of {numbers:g} numbers,", "give a part of it")
-        variables = scipy_io.loadmat(path, chars_as_strings=False)
+        names = [each.name for each in listed if each.name and not each.is_object]
+        variables = scipy_io.loadmat(path, chars_as_strings=False, variable_names=names)
     except InputError:
         raise
     except Exception as error:  # a damaged file raises any of a dozen kinds
@@ -285,7 +285,7 @@ def mat(path: Path) -> ArrayTable:
     for name, value in variables.items():
         if not name.startswith("__"):
             _variable(name, value, found)
-    return _in_memory(path, found)
+    return _in_memory(path, found | {each.name: _IS_OBJECT for each in listed if each.is_object})
 
 
 def _variable(name: str, value: Any, found: dict[str, Signal | str]) -> None:

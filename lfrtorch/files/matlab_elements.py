@@ -1,12 +1,15 @@
-"""Whether the elements of a MATLAB file are whole, before a library in C trusts their tags."""
+"""Variables of a MATLAB file whose elements are whole, before a library in C trusts their tags."""
 
 from __future__ import annotations
 
 import io
+import math
 import struct
 import zlib
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
+
+import numpy as np
 
 _HEADER = 128  # bytes
 _PIECE = 1 << 20  # bytes that are in memory at once
@@ -14,16 +17,28 @@ _PIECE = 1 << 20  # bytes that are in memory at once
 _NUMBERS = frozenset((1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18))  # kinds of elements
 _MATRIX, _PACKED = 14, 15
 _FLAT = frozenset(range(4, 16))  # classes of arrays that hold no other arrays
+_SPARSE = 5  # the class of arrays that have fewer numbers than their shape
+_OBJECT = 17  # the class of an object: its name comes next, and no shape
+_HEAD = 128  # bytes of an element that are looked at: shapes have 32 sizes, names 63 letters
 _DEEPEST = 32
 
 
-def check_elements(path: Path) -> None:
-    """Refuse a MATLAB 5 file whose elements do not lie in one another as the format says."""
+class Variable(NamedTuple):
+    """An array or object, and the numbers in it, those of the arrays that it holds among them."""
+
+    name: str
+    numbers: int
+    is_object: bool = False
+
+
+def variables_in(path: Path) -> list[Variable]:
+    """The variables of a MATLAB 5 file; refuse one whose elements do not lie as the format says."""
     # Source: MATLAB, "MAT-File Format", version 5.
     with path.open("rb") as stream:
         header = stream.read(_HEADER)
         order = "<" if header[126:] == b"IM" else ">"
-        _walk(stream, path.stat().st_size - _HEADER, order, frozenset((_MATRIX, _PACKED)), 0)
+        top = frozenset((_MATRIX, _PACKED))
+        return _walk(stream, path.stat().st_size - _HEADER, order, top, 0)[1]
 
 
 class _Unpacked(io.RawIOBase):
@@ -50,15 +65,16 @@ class _Unpacked(io.RawIOBase):
 
 def _walk(
     stream: IO[bytes], size: int | None, order: str, allowed: frozenset[int], depth: int
-) -> None:
-    """Check the elements in the next bytes of a stream, or up to its end."""
+) -> tuple[list[bytes], list[Variable]]:
+    """The first elements in the next bytes of a stream, or up to its end, and the arrays there."""
     if depth > _DEEPEST:
         raise ValueError(f"arrays lie more than {_DEEPEST} deep in one another")
-    left, first = size, True
+    left = size
+    heads, arrays = list[bytes](), list[Variable]()
     while left is None or left > 0:
         tag = stream.read(8)
         if not tag and size is None:
-            return
+            break
         if len(tag) < 8:
             raise ValueError("it is cut off")
         kind, length = struct.unpack(f"{order}II", tag)
@@ -66,7 +82,7 @@ def _walk(
         if kind >> 16:  # a small one, in its tag
             if kind >> 16 > 4:
                 raise ValueError(f"a small element has {kind >> 16} bytes")
-            kind, length, padded, content = kind & 0xFFFF, 0, 0, tag[4:]
+            kind, length, padded, content = kind & 0xFFFF, 0, 0, tag[4 : 4 + (kind >> 16)]
         else:
             padded = length if kind == _PACKED else -(-length // 8) * 8
         if kind not in allowed:
@@ -74,20 +90,39 @@ def _walk(
         if left is not None and (left := left - 8 - length) < 0:
             raise ValueError("an element is longer than what holds it")
         if kind == _MATRIX:
-            _walk(stream, length, order, _NUMBERS | {_MATRIX}, depth + 1)
+            inside = _walk(stream, length, order, _NUMBERS | {_MATRIX}, depth + 1)
+            arrays.append(_variable(*inside, order, length))
         elif kind == _PACKED:
             end = stream.tell() + length
             unpacked = io.BufferedReader(_Unpacked(stream, length))
-            _walk(unpacked, None, order, frozenset((_MATRIX,)), depth + 1)
+            arrays += _walk(unpacked, None, order, frozenset((_MATRIX,)), depth + 1)[1]
             stream.seek(end)
         else:
-            content = _skip(stream, padded) or content
+            content = _skip(stream, padded)[:length] or content
         left = left if left is None else left - (padded - length)
-        if first and depth and kind != _MATRIX:
-            flags = struct.unpack(f"{order}I", content[:4])[0] if len(content) >= 4 else 0
-            if flags & 0xFF in _FLAT:
-                allowed = _NUMBERS
-        first = False
+        if not heads and depth and kind != _MATRIX and _class(content, order) in _FLAT:
+            allowed = _NUMBERS
+        if len(heads) < 3:
+            heads.append(content)
+    return heads, arrays
+
+
+def _class(flags: bytes, order: str) -> int:
+    """The class of an array, by its first element."""
+    return struct.unpack(f"{order}I", flags[:4])[0] & 0xFF if len(flags) >= 4 else 0
+
+
+def _variable(heads: list[bytes], inside: list[Variable], order: str, length: int) -> Variable:
+    """An array by its first elements: flags, shape and name."""
+    flags, shape, name = (*heads, b"", b"", b"")[:3]
+    kind = _class(flags, order)
+    if kind == _OBJECT:
+        return Variable(shape.decode("latin-1"), 0, is_object=True)
+    sizes = np.frombuffer(shape[: len(shape) // 4 * 4], f"{order}i4").tolist()
+    if min(sizes, default=0) < 0:
+        raise ValueError("an array of negative size")
+    numbers = length // 8 if kind == _SPARSE else math.prod(sizes) if sizes else 0
+    return Variable(name.decode("latin-1"), numbers + sum(each.numbers for each in inside))
 
 
 def _skip(stream: IO[bytes], size: int) -> bytes:
@@ -97,5 +132,5 @@ def _skip(stream: IO[bytes], size: int) -> bytes:
         piece = stream.read(min(size, _PIECE))
         if not piece:
             raise ValueError("it is cut off")
-        start, size = start or piece[:8], size - len(piece)
+        start, size = start or piece[:_HEAD], size - len(piece)
     return start

@@ -1,10 +1,13 @@
 """Files of every format as tables of channels: layouts, missing values, memory and refusals."""
 
 import gzip
+import io
 import os
+import struct
 import sys
 import tracemalloc
 import zipfile
+import zlib
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -455,6 +458,35 @@ def test_structs_and_cells_of_mat_5(tmp_path):
     refused(table, "name", "has no numbers")
     assert np.array_equal(whole(table, "wide"), U)
     refused(table, "square", "is 40 × 40, and time may run along either axis; store its channels")
+
+
+def test_objects_in_mat_5_leave_the_arrays_beside_them(tmp_path):
+    def element(kind: int, content: bytes) -> bytes:
+        return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+    def named(name: str) -> bytes:  # as MATLAB writes a timetable: its parts lie elsewhere
+        parts = element(6, struct.pack("<II", 13, 0)) + element(5, struct.pack("<ii", 2, 1))
+        parts += element(1, b"") + element(6, struct.pack("<II", 0xDD000000, 2))
+        words = b"".join(element(1, word) for word in (name.encode(), b"MCOS", b"timetable"))
+        return element(14, element(6, struct.pack("<II", 17, 0)) + words + element(14, parts))
+
+    stream = io.BytesIO()
+    scipy.io.savemat(stream, {"u": U, "exp": {"y": Y}})
+    packed = zlib.compress(named("model"))
+    packed = struct.pack("<II", 15, len(packed)) + packed
+    stream.seek(0)
+    header, arrays = stream.read(128), stream.read()
+    (tmp_path / "a.mat").write_bytes(header + named("runs") + arrays + packed)
+    table = open_table(tmp_path / "a.mat")
+    assert np.array_equal(whole(table, ["u", "exp.y"]), SIGNALS)
+    refused(table, "runs", "is an object")
+    refused(table, "model", "is an object")
+
+
+def test_a_large_sparse_matrix_in_mat_5_takes_no_memory_of_a_full_one(tmp_path):
+    sparse = scipy.sparse.csc_matrix(([1.0], ([0], [0])), shape=(10**7, 10**5))
+    scipy.io.savemat(tmp_path / "a.mat", {"rig": {"K": sparse}, "K": sparse, "u": U, "y": Y})
+    assert np.array_equal(whole(open_table(tmp_path / "a.mat"), ["u", "y"]), SIGNALS)
 
 
 def matlab_file(path: Path, write) -> None:
