@@ -34,6 +34,7 @@ _GAP = 3.0  # heights that are this many times the next lower one are no part of
 # Outliers are farther from all other samples than BEYOND of these samples' range, or higher than
 # ABOVE times their largest jump, and than STEPS steps of the converter.
 _BEYOND, _ABOVE, _STEPS = 0.2, 1.5, 5.0
+_END = 1.0  # the first and last two, which may be a rest or a transient, than this part of it
 
 # An input is active if it jumped in the last BEFORE samples by ACTIVE times what is usual. What
 # sticks out of an output then is its response, unless the inputs are active for more than RARELY of
@@ -85,7 +86,11 @@ def _sticking_out(x: Array) -> Integers:
     low, high = float(x[~found].min()), float(x[~found].max())
     jumps = np.abs(np.diff(x))[~found[1:] & ~found[:-1]]
     outside = np.maximum(x - high, low - x)
-    found &= (outside > _BEYOND * (high - low)) | (height > _ABOVE * jumps.max(initial=0.0))
+    inner = np.zeros(T, bool)
+    inner[2:-2] = True
+    found &= (outside > np.where(inner, _BEYOND, _END) * (high - low)) | (
+        inner & (height > _ABOVE * jumps.max(initial=0.0))
+    )
     between = np.zeros(T, bool)  # a good sample between two bad ones sticks out on their other side
     between[1:-1] = found[:-2] & found[2:] & (outside[1:-1] <= 0)
     return np.flatnonzero(found & ~between)
@@ -97,11 +102,10 @@ def _heights(x: Array) -> Array:
     def three(of: Callable[[Array, Array], Array], x: Array) -> Array:
         return of(of(x[:-2], x[1:-1]), x[2:])
 
-    opened = three(np.maximum, three(np.minimum, x))
-    closed = three(np.minimum, three(np.maximum, x))
-    height = np.zeros(len(x))
-    height[2:-2] = np.maximum(x[2:-2] - opened, closed - x[2:-2])
-    return height
+    around = np.pad(x, 2, mode="reflect")
+    opened = three(np.maximum, three(np.minimum, around))
+    closed = three(np.minimum, three(np.maximum, around))
+    return np.maximum(x - opened, closed - x)
 
 
 def _limit(height: Array) -> float:

@@ -100,6 +100,21 @@ def test_outliers_of_inputs(name):
     assert input_outliers(bad, response[:, None]).tolist() == where
 
 
+@pytest.mark.parametrize("where", [0, 1, T - 2, T - 1])
+def test_outliers_at_the_ends(where: int):
+    rng = np.random.default_rng(0)
+    for name in ("noise", "multisine", "slow levels", "walk"):
+        y = SIGNALS[name](rng)
+        y[where] += 30 * y.std()
+        assert input_outliers(y).tolist() == [where]
+
+
+def test_a_transient_at_the_start_is_no_outlier():
+    y = SIGNALS["multisine"](np.random.default_rng(0))
+    assert not input_outliers(y + 30 * 0.5**K).size
+    assert not input_outliers(np.append(-3.0, y[1:])).size
+
+
 def test_two_bad_samples_side_by_side_and_a_good_one_between():
     y = multisine(np.random.default_rng(0))
     y[[400, 401, 800, 802]] = -9.0, -8.0, 9.0, 9.0
