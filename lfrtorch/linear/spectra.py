@@ -107,8 +107,9 @@ def _spectra(data: Sequence[Record], windows: list[slice], N: int) -> Spectra:
     if constant.any():
         what = "input" if known[0] is None else "the reference of input"
         raise InputError(
-            f"{what} '{data[0].inputs[int(np.argmax(constant))].name}' is constant in all records; "
-            "leave it out, or give records in which it is excited."
+            f"{what} '{data[0].inputs[int(np.argmax(constant))].name}' is constant in each record: "
+            "a spectrum does not show what it does; give records in which it moves, or leave it "
+            "out if it is the same in all."
         )
     ny = data[0].y.shape[1]
     size = ny + data[0].u.shape[1]

@@ -101,11 +101,10 @@ def survey_measurement(
         period = find_period(u[whole])
     surveys = []
     for i, (signal, channel) in enumerate(zip(signals.T, named, strict=True)):
-        part = signal[whole]
-        own = period if nu or not length else find_period(part)
-        followed = u[whole] if i >= nu > 0 else None
+        own = period if nu or not length else find_period(signal[whole])
+        followed = u if i >= nu > 0 else None
         surveys.append(
-            survey_signal(signal, part, channel, fs=fs or 1.0, period=own, inputs=followed)
+            survey_signal(signal, whole, channel, fs=fs or 1.0, period=own, inputs=followed)
         )
     return Survey(tuple(surveys[:nu]), tuple(surveys[nu:]), fs, whole)
 

@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 
-from lfrtorch._support.types import Array
+from lfrtorch._support.types import Array, Integers
 from lfrtorch.records import Record, as_records
 from lfrtorch.survey.causality import TwoSidedResponse, two_sided_response
 from lfrtorch.survey.integration import chain, grows, integrators, rates
 from lfrtorch.survey.measurement import Survey, survey_measurement
 from lfrtorch.survey.mechanics import reacting, rubs
 from lfrtorch.survey.outliers import input_outliers, output_outliers
-from lfrtorch.survey.signal import SignalSurvey, longest_run
+from lfrtorch.survey.sensors import frozen, marked
+from lfrtorch.survey.signal import SignalSurvey
 
 _SHORT = 300  # samples: a small NL-LFR model has 50 to 100 parameters
 _ENOUGH = 100  # samples of a record for notes on what it excites
 _MOST = 2**21  # samples of a record that are looked at, the first ones after ``skip``
 
-# Inputs stand still if all of them stay within REST of their rms for the share STILL of the record,
-# which is looked at in STRETCHES parts.
-_STILL, _STRETCHES, _REST = 0.2, 200, 0.05
+# All stands still if for the share STILL of the record, which is looked at in STRETCHES parts, the
+# inputs stay within REST of their rms, the outputs' means over the parts within SETTLED of theirs,
+# and an output's rms within each part is at most QUIET of that in the record.
+_STILL, _STRETCHES, _REST, _SETTLED, _QUIET = 0.2, 200, 0.05, 0.1, 0.2
 
 # A record is oversampled if all power lies below fs / OVERSAMPLED; decimation leaves it below
 # fs / WANTED.
@@ -60,17 +63,30 @@ class Note(NamedTuple):
 
 
 def examine(
-    found: Survey, u: Array, y: Array, *, skipped: int = 0, given: Mapping[str, Any] | None = None
+    found: Survey,
+    u: Array,
+    y: Array,
+    *,
+    skipped: int = 0,
+    moving: Sequence[bool] = (),
+    given: Mapping[str, Any] | None = None,
 ) -> list[Note]:
     """Return notes on a measurement u (T, nu), y (T, ny); none on one that was made well.
 
     Args:
         found: its survey. Without inputs all signals count as outputs.
         skipped: samples of the record before these, which count in the numbers of samples.
+        moving: the inputs that move elsewhere, in other records or in skipped samples.
         given: arguments of :func:`lfrtorch.estimate_bla` that are set: what they do already is not
             advised.
     """
-    notes = [*_levels(found, u, y, skipped), *_outliers(found, u, y, skipped)]
+    notes = [*_missing(found)]
+    faults, u, y = _faults(found, u, y, skipped)
+    if faults:  # all else is looked at without them
+        inputs, outputs = ([one.channel for one in side] for side in (found.inputs, found.outputs))
+        period = found.inputs[0].period if inputs else None
+        found = survey_measurement(u, y, found.fs, inputs=inputs, outputs=outputs, period=period)
+    notes += [*faults, *_levels(found, u, y, skipped, moving), *_outliers(found, u, y, skipped)]
     u, y = u[found.whole], y[found.whole]
     if len(y) >= _ENOUGH:
         notes += _excitation(found, u, skipped)
@@ -87,6 +103,8 @@ def notes_on(
     at; ``given`` is that of :func:`examine`.
     """
     data = as_records(records)
+    levels = np.concatenate([r.u for r in data])
+    moving = (np.ptp(levels, axis=0) > 0).tolist()
     by_kind: dict[str, list[tuple[str, str]]] = {}
     for r in data:
         scored = slice(r.skip, r.skip + _MOST)
@@ -96,7 +114,8 @@ def notes_on(
         found = survey_measurement(
             r.u[scored], r.y[scored], r.fs, inputs=r.inputs, outputs=r.outputs, period=r.period
         )
-        for kind, text in examine(found, r.u[scored], r.y[scored], skipped=r.skip, given=known):
+        seen = examine(found, r.u[scored], r.y[scored], skipped=r.skip, moving=moving, given=known)
+        for kind, text in seen:
             if kind.startswith("integrates") and r.start == "estimated":
                 continue  # a fit says it, if its model does not integrate
             settled = r.start == "measured" or np.any(known.get("integrators", 0))
@@ -110,12 +129,10 @@ def notes_on(
     return sentences
 
 
-def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
-    """Missing samples, constant, stuck, clipped and coarse signals, a short record."""
-    roles = bool(found.inputs)
-    T = len(y)
+def _missing(found: Survey) -> Iterator[Note]:
+    """Samples without a value."""
     for one in found.signals:
-        name = one.channel.name
+        name, T = one.channel.name, one.samples
         if one.missing == T:
             yield Note(f"missing {name}", f"'{name}' has no values at all; leave it out.")
         elif one.missing:
@@ -124,27 +141,85 @@ def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
                 f"'{name}' misses {one.missing} of {T} samples, up to {one.gap} in a row: outputs "
                 "are not fitted there; fill the gaps of inputs, or cut there by gaps='split'.",
             )
-        if one.values == 1:
-            told = f"'{name}' is constant at {one.mean:.6g}"
-            if not roles:
-                text = f"{told}: it tells nothing."
-            elif one in found.inputs:
-                text = (
-                    f"input {told}: it has no power and tells nothing; leave it out of the inputs."
+
+
+def _faults(found: Survey, u: Array, y: Array, skipped: int) -> tuple[list[Note], Array, Array]:
+    """Notes on what sensors wrote that they did not measure, and the signals without it."""
+    notes = list[Note]()
+    u, y = u.copy(), y.copy()
+    nu = u.shape[1]
+    for i, (one, signal) in enumerate(zip(found.signals, (*u.T, *y.T), strict=True)):
+        name, of_input = one.channel.name, i < nu
+        kind = ("input " if of_input else "output ") if nu else ""
+        remedy = "fill these cells" if of_input else "empty these cells, or Record(valid=...)"
+        marks = marked(signal, of_input=of_input)
+        for value in np.unique(signal[marks]):
+            k = np.flatnonzero(signal == value)
+            notes.append(
+                Note(
+                    f"mark {name} {value:g}",
+                    f"{kind}'{name}' is exactly {value:g} in {len(k)} samples, at "
+                    f"{_numbered(k, skipped)}, far from all other values: a mark for a missing "
+                    f"value, or a dropout; {remedy}.",
                 )
-            else:
-                text = f"output {told}: it does not respond; check the sensor and the column."
-            yield Note(f"constant {name}", text)
-    still = _still(found.inputs, u)
-    if still[1] >= _STILL * max(T, _ENOUGH):
+            )
+        known = np.flatnonzero(np.isfinite(signal) & ~marks)
+        if marks.any():
+            signal[marks] = np.interp(np.flatnonzero(marks), known, signal[known])
+        parts = [] if of_input else frozen(signal, u)
+        if parts:
+            shown = " and ".join(
+                f"at {signal[part.start]:.6g} in samples {skipped + part.start} to "
+                f"{skipped + part.stop - 1}"
+                for part in parts
+            )
+            notes.append(
+                Note(
+                    f"frozen {name}",
+                    f"{kind}'{name}' stays exactly {shown}, while the input moves, and changes "
+                    f"at each sample else around it: check the sensor; {remedy}.",
+                )
+            )
+        for part in parts:
+            signal[part] = np.nan
+    return notes, u, y
+
+
+def _levels(
+    found: Survey, u: Array, y: Array, skipped: int, moving: Sequence[bool]
+) -> Iterator[Note]:
+    """Constant, clipped and coarse signals, a rest, a short record."""
+    roles, T = bool(found.inputs), len(y)
+    alone = not any(one.rms > 0 for one in found.inputs)
+    elsewhere = [*moving, *[False] * len(found.signals)]
+    for one, moves in zip(found.signals, elsewhere, strict=False):
+        if one.values != 1 or moves:
+            continue
+        told = f"'{one.channel.name}' is constant at {one.mean:.6g}"
+        if not roles:
+            text = f"{told}: it tells nothing."
+        elif one not in found.inputs:
+            text = f"output {told}: it does not respond; check the sensor and the column."
+        elif alone and any(output.rms > 0 for output in found.outputs):
+            text = (
+                f"input {told} and the output moves: if it steps at the first sample, put samples "
+                "from before the step in front; if another input moves the output, name that one."
+            )
+        else:
+            text = (
+                f"input {told}: it tells nothing, unless it differs in other records; "
+                "leave it out of the inputs if it does not."
+            )
+        yield Note(f"constant {one.channel.name}", text)
+    first, length = _still(found, u, y)
+    if length >= _STILL * max(T, _ENOUGH):
         yield Note(
             "still",
-            f"{_listed(found.inputs)} {'is' if len(found.inputs) == 1 else 'are'} constant in "
-            f"{100 * still[1] / T:.0f} % of the record (samples "
-            f"{skipped + still[0]} to {skipped + sum(still)}): little is learnt there; cut it "
-            "off, or excite the system all the time.",
+            f"no input or output moves in {100 * length / T:.0f} % of the record (samples "
+            f"{skipped + first} to {skipped + first + length}): little is learnt there; cut most "
+            "of it off, or excite the system all the time.",
         )
-    for one, signal in zip(found.outputs, y.T, strict=True):
+    for one in found.outputs:
         name, kind = one.channel.name, "output " if roles else ""
         for end in one.clipped:
             what = "largest" if end is one.maximum else "smallest"
@@ -153,16 +228,6 @@ def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
                 f"{kind}'{name}' has its {what} value {end.value:.6g} in {end.samples} samples "
                 f"({100 * end.samples / T:.2g} %), {end.run} in a row: it is clipped; if by the "
                 "sensor, use more range, or give its limits.",
-            )
-        first, length = longest_run(np.diff(signal) == 0)
-        length += 1
-        stuck = length >= 0.1 * T and one.values > 2 and not one.clipped
-        if stuck and not (roles and _rests(found.inputs, u[first : first + length])):
-            yield Note(
-                f"stuck {name}",
-                f"{kind}'{name}' stays at {signal[first]:.6g} for {length} samples "
-                f"({100 * length / T:.0f} % of the record)"
-                f"{' while the input moves' if roles else ''}: check the sensor.",
             )
         if T > _FEW and one.values > 2 and one.step > _COARSE * one.rms:
             yield Note(
@@ -187,14 +252,14 @@ def _outliers(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]
         if not len(k):
             continue
         kind = ("input " if i < u.shape[1] else "output ") if found.inputs else ""
-        shown = ", ".join(str(skipped + sample) for sample in k[:_SHOWN])
-        more = f" and {len(k) - _SHOWN} more" if len(k) > _SHOWN else ""
-        remedy = "interpolate, or leave the outputs that follow out"
+        remedy = "leave them out"
+        if kind == "input ":
+            remedy = "interpolate, or leave the outputs that follow out"
         yield Note(
             f"outliers {one.channel.name}",
-            f"{kind}'{one.channel.name}' has {len(k)} outlier(s), at sample {shown}{more}: if "
-            f"misread, {remedy if kind == 'input ' else 'leave them out'}, by Record(valid=...) "
-            "or an empty cell of the output.",
+            f"{kind}'{one.channel.name}' has {len(k)} outlier(s), at sample "
+            f"{_numbered(k, skipped)}: if misread, {remedy}, by "
+            "Record(valid=...) or an empty cell of the output.",
         )
 
 
@@ -384,28 +449,31 @@ def _trend(signal: Array) -> tuple[float, float]:
     return (slope**2 * float(k @ k) / (len(k) * variance) if variance else 0.0), slope
 
 
-def _still(inputs: Sequence[SignalSurvey], u: Array) -> tuple[int, int]:
-    """First sample and length of the longest part of inputs (T, nu) in which none moves."""
-    if not any(one.rms > 0 for one in inputs):
+def _still(found: Survey, u: Array, y: Array) -> tuple[int, int]:
+    """First sample and length of the longest part in which no input or output (T, n) moves."""
+    if not any(one.rms > 0 for one in found.inputs):
         return 0, 0
-    rest = _REST * np.array([one.rms for one in inputs])
+    u, y = (
+        np.nan_to_num((s - [one.mean for one in of]) / [one.rms or 1.0 for one in of])
+        for s, of in ((u, found.inputs), (y, found.outputs))
+    )
     edges = np.linspace(0, len(u), min(_STRETCHES, len(u)) + 1).astype(int)
-    low, high = (extreme.reduceat(u, edges[:-1]) for extreme in (np.fmin, np.fmax))
+    parts = [slice(*ends) for ends in pairwise(edges)]
+    ends = np.array([[u[part].min(axis=0), u[part].max(axis=0)] for part in parts])
+    means = np.array([y[part].mean(axis=0) for part in parts])
+    rests = np.array([(y[part].std(axis=0) <= _QUIET).all() for part in parts])
     longest, last = (0, 0), 0
-    for first in range(len(low)):
+    for first in range(len(parts)):
         last = max(first, last)
-        while last < len(low) and np.all(
-            high[first : last + 1].max(axis=0) - low[first : last + 1].min(axis=0) <= rest
+        while (
+            last < len(parts)
+            and rests[last]
+            and (np.ptp(ends[first : last + 1], axis=(0, 1)) <= _REST).all()
+            and (np.ptp(means[first : last + 1], axis=0) <= _SETTLED).all()
         ):
             last += 1
         longest = max(longest, (int(edges[last] - edges[first]), int(edges[first])))
     return longest[1], longest[0]
-
-
-def _rests(inputs: Sequence[SignalSurvey], part: Array) -> bool:
-    """Whether no input moves in a part (T, nu) of the record."""
-    spread = np.fmax.reduce(part) - np.fmin.reduce(part)
-    return not np.any(spread > _REST * np.array([one.rms for one in inputs]))
 
 
 def _frequencies(signal: Array) -> int:
@@ -416,13 +484,14 @@ def _frequencies(signal: Array) -> int:
     return int(max(groups, np.ceil(np.sum(excited) / _LOBE)))
 
 
+def _numbered(k: Integers, skipped: int) -> str:
+    """Numbers of the first samples of k (n,), and how many more there are."""
+    shown = ", ".join(str(skipped + sample) for sample in k[:_SHOWN])
+    return shown + (f" and {len(k) - _SHOWN} more" if len(k) > _SHOWN else "")
+
+
 def _after(skipped: int) -> str:
     return f" after the {skipped} that are skipped" if skipped else ""
-
-
-def _listed(signals: Sequence[SignalSurvey]) -> str:
-    kind = "input" if len(signals) == 1 else "inputs"
-    return f"{kind} " + ", ".join(f"'{one.channel.name}'" for one in signals)
 
 
 def _unit(found: Survey) -> str:

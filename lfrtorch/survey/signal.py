@@ -22,7 +22,12 @@ _SEGMENTS, _LONGEST = 8, 4096  # least segments of an averaged spectrum, and mos
 # A signal is clipped if it is at an extreme for SAMPLES, RUN of them in a row, and RATIO times as
 # often as at any of the next NEIGHBOURS values. (A sine in coarse steps has a ratio of 2.4.)
 _CLIPPED_SAMPLES, _CLIPPED_RUN, _CLIPPED_RATIO, _NEIGHBOURS = 5, 3, 5, 5
+
+# It is not clipped but rests where the record begins, and where no input moves as it comes there,
+# by a last change of SMOOTH of its rms or of two steps of the converter at most.
+_SMOOTH = 0.01
 _LEVELS = 16  # a signal of so few values consists of levels, like a binary one; it is not clipped
+_REST = 0.05  # a signal that stays within this part of its rms does not move
 _SILENT = 1e-10  # power of a combination of inputs, relative to the largest, that counts as none
 
 
@@ -79,7 +84,7 @@ class SignalSurvey(NamedTuple):
 
 def survey_signal(
     signal: Array,
-    whole: Array,
+    whole: slice,
     channel: Channel,
     *,
     fs: float = 1.0,
@@ -87,15 +92,15 @@ def survey_signal(
     inputs: Array | None = None,
 ) -> SignalSurvey:
     """Return the numbers of a signal (T,), NaN where a sample is missing."""
-    # ``whole`` is its longest part without gaps, for the spectrum, and ``inputs`` (N, nu) what that
-    # part (N,) follows, if it is an output.
+    # ``whole`` is its longest part without gaps, for the spectrum, and ``inputs`` (T, nu) what it
+    # follows, if it is an output.
     missing = ~np.isfinite(signal)
     known = signal[~missing] if missing.any() else signal
     values, counts = np.unique(known, return_counts=True)
     some = len(values) > 0
     noise, method = None, ""
     if len(values) > 1:
-        noise, method = _noise(whole, period, inputs)
+        noise, method = _noise(signal[whole], period, None if inputs is None else inputs[whole])
     return SignalSurvey(
         channel,
         samples=len(signal),
@@ -103,24 +108,37 @@ def survey_signal(
         gap=longest_run(missing)[1],
         mean=float(known.mean()) if some else np.nan,
         rms=float(known.std()) if len(values) > 1 else 0.0 if some else np.nan,
-        minimum=_extreme(signal, values, counts),
-        maximum=_extreme(signal, values[::-1], counts[::-1]),
+        minimum=_extreme(signal, values, counts, inputs),
+        maximum=_extreme(signal, values[::-1], counts[::-1], inputs),
         values=len(values),
         step=float(np.diff(values).min()) if len(values) > 1 else np.nan,
-        band=band(whole, fs),
+        band=band(signal[whole], fs),
         period=period,
         noise=noise,
         method=method,
     )
 
 
+def runs(holds: Booleans) -> Integers:
+    """First samples and lengths (n, 2) of the runs of samples for which a condition (T,) holds."""
+    ends = np.flatnonzero(np.diff(holds.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    return np.column_stack([ends[:, 0], ends[:, 1] - ends[:, 0]])
+
+
 def longest_run(holds: Booleans) -> tuple[int, int]:
     """First sample and length of the longest run of samples for which a condition (T,) holds."""
-    ends = np.flatnonzero(np.diff(holds.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    if not len(ends):
+    found = runs(holds)
+    if not len(found):
         return 0, 0
-    first, last = ends[np.argmax(ends[:, 1] - ends[:, 0])]
-    return int(first), int(last - first)
+    first, length = found[np.argmax(found[:, 1])]
+    return int(first), int(length)
+
+
+def moves(u: Array, parts: Integers) -> list[bool]:
+    """Whether any of the signals u (T, nu) moves in parts (n, 2), from first to past end."""
+    least = _REST * np.nanstd(u, axis=0)
+    part = (u[first:end] for first, end in parts)
+    return [bool(np.any(np.fmax.reduce(s) - np.fmin.reduce(s) > least)) for s in part]
 
 
 def band(signal: Array, fs: float = 1.0) -> tuple[float, float] | None:
@@ -134,16 +152,23 @@ def band(signal: Array, fs: float = 1.0) -> tuple[float, float] | None:
     return float(f[1 + low]), float(f[1 + high])
 
 
-def _extreme(signal: Array, values: Array, counts: Integers) -> Extreme:
+def _extreme(signal: Array, values: Array, counts: Integers, inputs: Array | None) -> Extreme:
     """The first of the values, and whether the signal is clipped at it."""
     if not len(values):
         return Extreme(np.nan, 0, 0, False)
-    samples, run = int(counts[0]), longest_run(signal == values[0])[1]
+    found = runs(signal == values[0])
+    samples, run = int(counts[0]), int(found[:, 1].max())
     clipped = (
         len(values) > _LEVELS
         and samples >= max(_CLIPPED_SAMPLES, _CLIPPED_RATIO * counts[1 : 1 + _NEIGHBOURS].max())
         and run >= _CLIPPED_RUN
     )
+    if clipped and inputs is not None:
+        first, length = found[(found[:, 0] > 0) & (found[:, 1] >= _CLIPPED_RUN)].T
+        smooth = max(_SMOOTH * np.nanstd(signal), 2 * np.abs(np.diff(values)).min())
+        arrives = np.abs(signal[first] - signal[first - 1]) > smooth
+        driven = np.array(moves(inputs, np.column_stack([first - 1, first + length // 2])), bool)
+        clipped = np.any(arrives | driven)
     return Extreme(float(values[0]), samples, run, bool(clipped))
 
 

@@ -120,16 +120,48 @@ def test_missing(u):
 def test_constant(u):
     y = lag(u)
     both = np.column_stack([u, np.full(T, 3.0)])
-    assert "input 'u2' is constant at 3: it has no power" in found(both, y)["constant"]
+    assert "input 'u2' is constant at 3: it tells nothing, unless" in found(both, y)["constant"]
     assert "output 'y1' is constant" in found(u, np.ones(T))["constant"]
     assert "'y2' is constant at 3" in found(np.empty((T, 0)), both)["constant"]
+
+
+def test_an_input_that_differs_between_records_is_not_left_out(u):
+    records = [Record(np.column_stack([u, np.full(T, v)]), v * lag(u)) for v in (0.5, 1.0, 2.0)]
+    assert notes_on(records) == []
+    assert "constant at 0.5" in notes_on(records[:1])[0]
+    assert "and 1 more: input 'u2' is constant" in notes_on([records[0], records[0]])[0]
+
+
+def test_an_input_that_moves_in_skipped_samples_alone_is_not_left_out():
+    u = np.zeros(T)
+    u[10:14] = 5.0
+    assert notes_on(Record(u, lag(u, 0.99), skip=20)) == []
+
+
+def test_a_step_at_the_first_sample_is_not_left_out():
+    u = np.full(T, 7.0)
+    said = found(u, lag(u))["constant"]
+    assert "put samples from before the step in front" in said
+    assert "leave it out" not in said
+
+
+def step(at: int, pole: float = 0.9, noise: float = NOISE) -> tuple[Array, Array]:
+    u = np.where(np.arange(T) < at, 0.0, 1.0)
+    return u, lag(u, pole, noise)
+
+
+def test_a_step_response_is_not_cut_off():
+    said = found(*step(500))
+    assert "no input or output moves in 90 % of the record (samples 525 to" in said["still"]
+    slow = found(*step(500, pole=0.9995))  # is on its way in the whole record
+    assert "still" not in slow
 
 
 def test_input_at_rest(u):
     u[1000:3000] = 0.5
     said = found(u, lag(u))
     assert set(said) == {"still"}
-    assert "input 'u1' is constant in 40 % of the record (samples 1000 to 3000)" in said["still"]
+    assert "moves in 40 % of the record (samples 1025 to 3000)" in said["still"]
     u[1000:3000] += 1e-3 * np.random.default_rng(3).standard_normal(2000)  # as measured
     assert set(found(u, lag(u))) == {"still"}
 
@@ -164,18 +196,55 @@ def test_steps_of_a_converter_are_not_clipped_but_coarse():
     assert found(u, np.round(y / 0.02) * 0.02) == {}
 
 
-def test_stuck_output(u):
+@pytest.mark.parametrize("noise", [0.0, NOISE])
+def test_what_rests_is_not_clipped(noise: float):
+    """Before a step, after one, and between pulses, exactly or in steps of a converter."""
+    u, y = step(500, noise=noise)
+    y[:500] = 0.0
+    assert "clipped" not in found(u, y)
+    assert "clipped" not in found(u, np.round(y, 2))
+    pulses = np.where(np.arange(T) % 500 < 40, 1.0, 0.0)
+    assert "clipped" not in found(pulses, np.round(lag(pulses, noise=noise), 1 if noise else 4))
+
+
+def test_levels_that_are_held_may_be_clipped():
+    u = np.repeat(np.random.default_rng(0).uniform(-1, 1, T // 50), 50)
+    assert "clipped" in found(u, np.minimum(lag(u), 0.5))
+
+
+@pytest.mark.parametrize("value", [-9999.0, 999.9])
+def test_marks_for_missing_values(value: float, u):
     y = lag(u)
-    y[2000:2800] = y[2000]
-    assert "for 800 samples (16 % of the record) while the input moves" in found(u, y)["stuck"]
-    y[2100:] = lag(u)[2100:]
-    assert found(u, y) == {}
+    y[[100, 700, 701, 2000, 3000]] = value
+    said = found(u, y)
+    assert set(said) == {"mark"}
+    assert f"is exactly {value:g} in 5 samples, at 100, 700, 701, 2000, 3000" in said["mark"]
+    assert "empty these cells" in said["mark"]
+    v = u.copy()
+    v[[5, 900, 901]] = value
+    assert "fill these cells" in found(v, lag(u))["mark"]
+
+
+def test_a_frozen_sensor(u):
+    for samples in (30, 60, 120):
+        y = lag(u)
+        y[2000 : 2000 + samples] = y[2000]
+        said = found(u, y)
+        assert set(said) == {"frozen"}
+        assert f"in samples 2000 to {1999 + samples}, while the input moves" in said["frozen"]
+
+
+def test_a_dropout_to_zero(u):
+    for offset in (0.0, 2.0, 6.0):  # inside, at the end of and outside the output's range
+        y = lag(u) / 0.23 + offset
+        y[2000:2020] = 0.0
+        assert "stays exactly at 0 in samples 2000 to 2019" in found(u, y)["frozen"]
 
 
 def test_an_output_at_rest_with_its_input_is_not_stuck(u):
     u[1000:1900] = 0.0
     y = np.round(lag(u, 0.5, noise=0), 4)
-    assert found(u, y) == {}
+    assert not {"frozen", "clipped"} & {*found(u, y)}
 
 
 def test_binary_input(u):
