@@ -19,6 +19,7 @@ from lfrtorch._support.checks import integer, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines
 from lfrtorch.cli.hydra_versions import instantiate
+from lfrtorch.cli.wording import as_words
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.fitting.settings import Settings
@@ -98,7 +99,8 @@ def loaded(cfg: DictConfig) -> Dataset:
         given["feedthrough"] = False
     if cfg.get("noise", "output") != "output":
         given["refine"] = given.get("refine") or "prediction"
-    notes = (*dataset.notes, *(notes_on(measured, given=given) if measured else ()))
+    said = (*dataset.notes, *(notes_on(measured, given=given) if measured else ()))
+    notes = tuple(map(as_words, said))
     for note in notes:
         print(in_lines(f"note: {note}"))
     return replace(dataset, notes=notes)

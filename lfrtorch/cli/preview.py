@@ -14,6 +14,7 @@ from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import real
 from lfrtorch.cli.composition import started
+from lfrtorch.cli.wording import as_words
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.glance import Glance, look_at
 from lfrtorch.files.load import EVERYTHING, is_fraction, listed_files, stem_of
@@ -88,7 +89,7 @@ def show(path: Path, data: DictConfig, figure: Path) -> None:
         listed = [list(one) for one in table.contents]
         print(f"\n{tables.table(['variable', 'shape', 'taken for'], listed)}")
     print(f"\n{found}\n")
-    for sentence in sentences:
+    for sentence in map(as_words, sentences):
         print(textwrap.fill(sentence, 100, initial_indent="- ", subsequent_indent="  "))
     if not sentences:
         print("Nothing found that would hurt a model.")

@@ -10,8 +10,10 @@ _LAGS = 20  # past samples that predict the next one, fewer in short records
 _MOST, _FEWEST = 20_000, 300  # samples that are looked at, the first ones of a long record
 
 # The input reacts if past surprises of the output explain REACTS of the input's own, and CHANCE
-# times what they would by chance. One whose surprises are below FORESEEN of it is planned.
-_REACTS, _CHANCE, _FORESEEN = 0.03, 5.0, 1e-3
+# times what they would by chance, and in either half of the record HALF of it: a controller acts
+# all the time, a sensor that froze or samples out of order do not. An input whose surprises are
+# below FORESEEN of it is planned.
+_REACTS, _CHANCE, _HALF, _FORESEEN = 0.03, 5.0, 0.5, 1e-3
 _WINDOWS, _SPAN = (1, 3, 10, 30, 100), 40  # samples of a moving mean; SPAN of them in a record
 
 # Friction is dry if the direction of motion, beside position, speed and acceleration, leaves at
@@ -32,15 +34,28 @@ def reacting(u: Array, y: Array, *, feedthrough: bool = True) -> Array:
         u: (T, nu), y: (T, ny) -> (nu,).
     """
     u, y = (s[:_MOST, np.ptp(s, axis=0) > 0] for s in (u, y))
+    if len(u) < _FEWEST:
+        return np.zeros(u.shape[1])
+    part, least = _explained(u, y, feedthrough)
+    part = np.where(part < least, 0.0, part)
+    for half in (slice(0, len(u) // 2), slice(len(u) // 2, None)) if part.any() else ():
+        again, least = _explained(u[half], y[half], feedthrough)
+        part = np.where(again < _HALF * least, 0.0, part)
+    return part
+
+
+def _explained(u: Array, y: Array, feedthrough: bool) -> tuple[Array, float]:
+    """Part of each input's surprises (nu,) that the outputs' explain, and the least that counts."""
     T, nu, ny = len(u), u.shape[1], y.shape[1]
     n = min(_LAGS, T // (10 * max(1, nu + ny)))
-    if n < 1 or T < _FEWEST or not nu * ny:
-        return np.zeros(nu)
-    u, y = ((s - s.mean(axis=0)) / s.std(axis=0) for s in (u, y))
+    none = np.zeros(nu)
+    if n < 1 or T < _FEWEST // 2 or not nu * ny:
+        return none, 1.0
+    u, y = ((s - s.mean(axis=0)) / np.maximum(s.std(axis=0), 1e-300) for s in (u, y))
     e = _left(y[n:], u[n:, : nu * feedthrough], _past(u, n), _past(y, n))
     e = e[:, e.std(axis=0) > 1e-7]  # rounding
     if not e.size:
-        return np.zeros(nu)
+        return none, 1.0
     e = e / e.std(axis=0)
     before, own = _past(e, n), _past(u[n:], n)
     if not feedthrough:
@@ -49,8 +64,7 @@ def reacting(u: Array, y: Array, *, feedthrough: bool = True) -> Array:
     power = np.maximum(np.sum(alone**2, axis=0), 1e-300)
     part = 1.0 - np.sum(both**2, axis=0) / power
     foreseen = np.sqrt(power / len(alone)) < _FORESEEN
-    by_chance = part < max(_REACTS, _CHANCE * n * ny / len(alone))
-    return np.where(foreseen | by_chance, 0.0, part)
+    return np.where(foreseen, 0.0, part), max(_REACTS, _CHANCE * n * ny / len(alone))
 
 
 def rubs(u: Array, y: Array) -> bool:

@@ -47,6 +47,7 @@ _DRIFT, _ALIKE, _OTHERS = 0.2, 3.0, 0.05
 # gain that rises with frequency speaks against it, as an integrator with feedthrough has it; then
 # the causality must be below CERTAIN.
 _BEFORE, _AFTER, _CERTAIN = -0.15, 0.5, -0.4
+_PLANNED = 1e-3  # rms over the signal's of what an input without feedback does not repeat
 _SHOWN = 6  # outliers that a note names; it counts the others
 
 # Coherence beyond chance above which the causality test means something, and below which the output
@@ -357,17 +358,19 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
             f"'{first}' integrates '{second}', which integrates, too: use start='measured', as the "
             "outputs tell the states, and horizon=N, the samples ahead that count.",
         )
-    changes = ["feedthrough=False"] if given.get("feedthrough", True) else []
+    changes, compare = ["feedthrough=False"] if given.get("feedthrough", True) else [], ""
     if given.get("refine") != "prediction" and not any(counts):
         changes.append("refine='prediction' or noise='innovation'")
+        compare = ", and compare with a fit without: what predicts best may simulate worse"
     moving = [one for one, signal in zip(found.inputs, u.T, strict=True) if np.ptp(signal) > 0]
     parts = reacting(u, y, feedthrough=bool(given.get("feedthrough", True)))
     for one, part in zip(moving, parts, strict=True):
-        if part and changes:
+        if part and changes and not _repeats(one):
             yield Note(
                 f"feedback {one.channel.name}",
                 f"input '{one.channel.name}' reacts to the output: a controller closes the loop, "
-                f"and noise biases a fit; use {' and '.join(changes)}, or give its reference=r.",
+                f"and noise biases a fit; try {' and '.join(changes)}, or give its reference=r"
+                f"{compare}.",
             )
     for i, output in enumerate(found.outputs):
         pairs = {j: pair for (k, j), pair in between.items() if k == i}
@@ -413,6 +416,11 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
                 )
         if not integrates:
             yield from _drift(output, y[:, i], u)
+
+
+def _repeats(one: SignalSurvey) -> bool:
+    """Whether an input repeats so well that no noise is in it, as a controller would bring."""
+    return one.method == "periods" and one.noise is not None and one.noise < _PLANNED * one.rms
 
 
 def _first(pair: TwoSidedResponse) -> bool:

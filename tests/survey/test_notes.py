@@ -432,10 +432,28 @@ def test_feedback_of_a_system_that_forgets(rng):
         x = 0.9 * x + 0.1 * u[k]
     assert "feedthrough=False and refine='prediction'" in found(u, y)["feedback"]
     (note,) = notes_on(Record(u, y), given={"feedthrough": False})
-    assert "use refine='prediction'" in note
-    assert note.endswith("or give its reference=r.")
+    assert "try refine='prediction'" in note
+    assert "reference=r, and compare with a fit without" in note
+    assert "compare" not in notes_on(Record(u, y), given={"refine": "prediction"})[0]
     assert notes_on(Record(u, y, reference=r)) == []
     assert notes_on(Record(u, y), given={"feedthrough": False, "refine": "prediction"}) == []
+
+
+def test_a_fault_in_one_place_is_no_feedback():
+    """A clock that was set back shuffles the samples of two stretches; a sensor freezes."""
+    rng = np.random.default_rng(0)
+    u = lfilter([1], [1, -0.6], rng.standard_normal(3000))
+    y = lfilter([0, 0.1], [1, -1.6, 0.7], u) + 0.02 * rng.standard_normal(3000)
+    order = np.arange(3000)
+    order[1300:1900] = order[1300:1900].reshape(2, 300).T.ravel()
+    assert "feedback" not in found(u[order], y[order])
+    y[1300:1420] = y[1300]
+    assert set(found(u, y)) == {"frozen"}
+
+
+def test_an_input_that_repeats_exactly_is_not_made_by_a_controller():
+    u = np.where(np.arange(3000) % 400 < 20, 1.0, 0.0)
+    assert "feedback" not in found(u, np.tanh(1.5 * lfilter([0, 0.3], [1, -1.3, 0.6], u)))
 
 
 def test_feedback_in_the_same_sample_is_seen_without_feedthrough(rng):
