@@ -4,6 +4,9 @@ The impulse response is estimated at negative and positive lags, as the inverse 
 Syu / Suu with averaged cross spectra. A causal system has its energy at lags ≥ 0. If input and
 output are exchanged, the energy is at negative lags; or at both, if the sampled system has
 feedthrough or its signals are band-limited, and then the response from output to input is causal.
+
+The dead time is the largest number of first lags without which past inputs explain the output as
+well, beside its own past, which stands for a response longer than the lags and for coloured noise.
 """
 
 from __future__ import annotations
@@ -14,7 +17,6 @@ import numpy as np
 import scipy
 
 from lfrtorch._support.types import Array, Complex
-from lfrtorch.metrics import rms
 
 # Numbers of segments of a record, for lags up to T / 8 or T / 16. The one that explains more of the
 # output is taken: short segments miss long memories and delays, few segments average little.
@@ -22,9 +24,9 @@ _SEGMENTS = (4, 8)
 _SHORTEST, _LONGEST = 32, 16384  # samples of a segment
 _FLOOR = 1e-2  # added to the input's power, relative: without power the response is 0
 
-# The response begins when it exceeds ONSET of its peak and CLEAR times its rms at negative lags.
-# If that limit is more than UNCLEAR of the peak, the delay is unknown.
-_ONSET, _CLEAR, _UNCLEAR = 0.1, 4.0, 0.5
+# Samples of the output's past, lags after the response's peak, and samples that tell a dead time.
+_PAST, _LATER, _MOST = 10, 30, 20_000
+_CHANCE = 1e-3  # with which lags that do nothing explain so much of the output
 
 
 class TwoSidedResponse(NamedTuple):
@@ -37,7 +39,6 @@ class TwoSidedResponse(NamedTuple):
     causality: float
     reverse: float  # the same from output to input
     rise: float  # gain of the reverse response in the upper third of y's frequencies over the lower
-    delay: int  # samples until the response begins; 0 if that is not clear
     peak: int  # lag of its largest value
 
 
@@ -50,13 +51,31 @@ def two_sided_response(u: Array, y: Array) -> TwoSidedResponse | None:
     return max(found, key=lambda one: one.coherence - one.chance, default=None)
 
 
+def dead_time(u: Array, y: Array, peak: int) -> int:
+    """Return the samples that an output (T,) waits for an input (T,), beside the usual first one.
+
+    Args:
+        peak: lag of the largest value of the response.
+    """
+    u, y = u[:_MOST], y[:_MOST]
+    lags = min(peak + _LATER, len(y) // 6)
+    n = max(lags, _PAST)
+    past = [y[n - i : len(y) - i] for i in range(1, _PAST + 1)]
+    inputs = [u[n - i : len(u) - i] for i in range(lags, -1, -1)]
+    columns = np.column_stack([np.ones(len(y) - n), *past, *inputs])
+    explained = np.linalg.qr(columns)[0].T @ y[n:]
+    left = float(y[n:] @ y[n:] - explained @ explained)
+    noise = max(left, np.finfo(float).eps * float(y[n:] @ y[n:])) / max(np.ptp(columns.shape), 1)
+    by_first = np.cumsum(explained[: -lags - 2 : -1] ** 2) / noise  # lags 0, 0 to 1, 0 to 2, ...
+    needed = by_first > scipy.special.chdtri(np.arange(1, lags + 2), _CHANCE)
+    return max(0, int(np.argmax(needed)) - 1)
+
+
 def _by_segments(u: Array, y: Array, length: int) -> TwoSidedResponse:
     _, Suu = scipy.signal.welch(u, nperseg=length)
     _, Syy = scipy.signal.welch(y, nperseg=length)
     _, Syu = scipy.signal.csd(u, y, nperseg=length)
     g = _response(Suu, Syu)
-    size, half = np.abs(g), length // 2
-    begun = max(_ONSET, _CLEAR * float(rms(g[half:]) / size.max()))
     excited = np.flatnonzero(Syy > _FLOOR * Syy.max())
     gain = np.abs(Syu[excited]) / Syy[excited]
     third = max(len(gain) // 3, 1)
@@ -67,8 +86,7 @@ def _by_segments(u: Array, y: Array, length: int) -> TwoSidedResponse:
         causality=_causality(g),
         reverse=_causality(_response(Syy, Syu.conj())),
         rise=float(np.median(gain[-third:]) / max(np.median(gain[:third]), tiny)),
-        delay=int(np.argmax(size[:half] >= begun * size.max())) if begun < _UNCLEAR else 0,
-        peak=int(np.argmax(size[:half])),
+        peak=int(np.argmax(np.abs(g[: length // 2]))),
     )
 
 

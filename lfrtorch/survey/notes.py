@@ -11,7 +11,7 @@ import scipy
 
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.records import Record, as_records
-from lfrtorch.survey.causality import TwoSidedResponse, two_sided_response
+from lfrtorch.survey.causality import TwoSidedResponse, dead_time, two_sided_response
 from lfrtorch.survey.integration import chain, grows, integrators, rates
 from lfrtorch.survey.measurement import Survey, survey_measurement
 from lfrtorch.survey.mechanics import reacting, rubs
@@ -53,7 +53,7 @@ _SHOWN = 6  # outliers that a note names; it counts the others
 # Coherence beyond chance above which the causality test means something, and below which the output
 # does not follow the inputs.
 _COHERENT, _UNRELATED = 0.1, 0.05
-_DELAY, _SHARP = 8, 0.5  # samples of a delay that is worth a shift; its share of the peak's lag
+_DELAY, _SHARP = 5, 0.5  # samples of a dead time worth a shift; its share of the peak's lag
 
 
 class Note(NamedTuple):
@@ -403,16 +403,20 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
             )
         for j, pair in pairs.items():
             if (
-                pair.coherence - pair.chance > _COHERENT
-                and pair.causality > _AFTER
-                and pair.delay >= max(_DELAY, _SHARP * pair.peak)
+                pair.coherence - pair.chance < _COHERENT
+                or pair.causality < _AFTER
+                or pair.peak < _DELAY
             ):
-                lasting = "" if found.fs is None else f" ({pair.delay / found.fs:.3g} s)"
+                continue
+            delay = dead_time(u[:, j], y[:, i], pair.peak)
+            if max(_DELAY, _SHARP * pair.peak) <= delay <= pair.peak:
+                lasting = "" if found.fs is None else f" ({delay / found.fs:.3g} s)"
                 yield Note(
                     f"delay {name} {j}",
-                    f"a delay of about {pair.delay} samples{lasting} from input "
-                    f"'{found.inputs[j].channel.name}' to output '{name}': shift the output by it, "
-                    "or a model spends as many states on it.",
+                    f"a dead time of about {delay} samples{lasting} from input "
+                    f"'{found.inputs[j].channel.name}' to output '{name}', beside the one sample "
+                    "of any system without feedthrough: shift the output by it, or a model spends "
+                    "as many states on it.",
                 )
         if not integrates:
             yield from _drift(output, y[:, i], u)
