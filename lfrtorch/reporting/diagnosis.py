@@ -334,7 +334,7 @@ def _guess(train: Sequence[Record], scale: Array) -> float | None:
     if record.valid is not None or not len(y):
         return None
     found = [
-        survey_signal(own, own, channel, inputs=u).noise
+        survey_signal(own, slice(None), channel, inputs=u).noise
         for own, channel in zip(y.T, record.outputs, strict=True)
     ]
     known = [noise for noise in found if noise is not None]

@@ -71,10 +71,10 @@ def test_a_model_is_as_slow_as_the_linear_one():
     for poles in ([0.999 * np.exp(0.3j), 0.999 * np.exp(-0.3j)], [1.0, 0.5]):
         A = np.diag(np.ones(1), 1)
         A[1] = -np.poly(poles).real[:0:-1]
-        channels = {"inputs": (lfrtorch.Channel("u"),), "outputs": (lfrtorch.Channel("y"),)}
         bla = lfrtorch.LinearModel(
             A, np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]]), np.zeros((1, 1)),
-            fs=1.0, u_offset=np.zeros(1), y_offset=np.zeros(1), **channels,
+            fs=1.0, u_offset=np.zeros(1), y_offset=np.zeros(1),
+            inputs=(lfrtorch.Channel("u"),), outputs=(lfrtorch.Channel("y"),),
         )  # fmt: skip
         record = Record(u, bla.simulate(u))
         model = bla.to_model()
