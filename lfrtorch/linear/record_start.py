@@ -50,6 +50,11 @@ class StartTrial(NamedTuple):
         """The start that a fit should have: an estimated one, unless rest is clearly better."""
         return "zero" if self.zero < _CLEARLY * self.estimated else "estimated"
 
+    @property
+    def in_motion(self) -> bool:
+        """Whether rest is clearly worse."""
+        return self.estimated < _CLEARLY * self.zero
+
     def __str__(self) -> str:
         """A sentence with both errors."""
         alike = min(self) >= _CLEARLY * max(self)

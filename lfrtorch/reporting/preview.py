@@ -71,7 +71,7 @@ def preview(record: Record) -> Preview:
             trial = try_starts(record)
         except ValueError:  # no linear model tells how it begins
             trial = None
-        if trial is not None and trial.chosen == "estimated":
+        if trial is not None and trial.in_motion:
             notes.append(f"{trial}, and the record has start 'zero'")
     figure = survey_figure(survey, np.hstack([record.u, y]), record.name)
     return Preview(survey, tuple(notes), figure)
