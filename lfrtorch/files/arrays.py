@@ -161,6 +161,9 @@ class ArrayTable(Table):
         super().__init__(
             path, headers, units=units, arrays=arrays, refused=refused, rates=rates, lengths=lengths
         )
+        objects = [repr(name) for name, reason in refused.items() if reason == _IS_OBJECT]
+        if objects:
+            self.notes = (f"left out: {', '.join(objects)}, as objects are not read",)
 
     def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
         """See :meth:`Table.blocks`."""

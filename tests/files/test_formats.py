@@ -481,6 +481,7 @@ def test_objects_in_mat_5_leave_the_arrays_beside_them(tmp_path):
     assert np.array_equal(whole(table, ["u", "exp.y"]), SIGNALS)
     refused(table, "runs", "is an object")
     refused(table, "model", "is an object")
+    assert table.notes == ("left out: 'runs', 'model', as objects are not read",)
 
 
 def test_a_large_sparse_matrix_in_mat_5_takes_no_memory_of_a_full_one(tmp_path):
