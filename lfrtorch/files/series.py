@@ -111,7 +111,7 @@ class SeriesTable(Table):
         for i in columns:
             if i in self._channels:
                 self._remark(self._channels[i].note)
-                parts.append((_held if i in held else _joined)(self._channels[i], t))
+                parts.append((_hold if i in held else _join)(self._channels[i], t))
             else:
                 parts.append(t)
         for i in held:
@@ -147,7 +147,7 @@ class SeriesTable(Table):
         running = [i for i in measured if i not in held]
         last = max(measured, key=lambda i: self._clock(i).t[0])
         first = min(running, key=lambda i: self._clock(i).t[-1])
-        begin, end = self._clock(last).t[0], self._clock(first).t[-1]
+        begin, end = float(self._clock(last).t[0]), float(self._clock(first).t[-1])
         if begin >= end:
             raise InputError(
                 f"'{self.path}': {self.headers[first]!r} ends at {end:.6g} s and "
@@ -176,9 +176,8 @@ class SeriesTable(Table):
             return clock.t[clock.t >= begin - _UNEVEN / clock.fs]
         fs = self._asked or float(f"{clock.fs:.3g}")  # any rate will do, so a round one
         self._remark(f"channels are interpolated to even times of {fs:.6g} Hz")
-        T = int((end - begin) * fs + 1e-6) + 1
-        self.check_memory(T * len(columns))
-        return begin + np.arange(T) / fs
+        self.check_memory((end - begin) * fs * len(columns))
+        return begin + np.arange(int((end - begin) * fs + 1e-6) + 1) / fs
 
     def _remark(self, note: str) -> None:
         if note and note not in self.notes:
@@ -249,13 +248,13 @@ def _on_change(channel: _Channel, fastest: _Clock) -> bool:
     return bool(_FAR * fs <= fastest.fs or beside.mean() >= _MOST or 2 * levels <= len(t))
 
 
-def _held(channel: _Channel, t: Array) -> Array:
+def _hold(channel: _Channel, t: Array) -> Array:
     """The last value at each instant; no instant is before the first value."""
     step = t[1] - t[0] if len(t) > 1 else 0.0
     return channel.values[np.searchsorted(channel.clock.t, t + _UNEVEN * step, "right") - 1]
 
 
-def _joined(channel: _Channel, t: Array) -> Array:
+def _join(channel: _Channel, t: Array) -> Array:
     """Straight lines between values, NaN in holes."""
     own = channel.clock.t
     if np.array_equal(own, t):

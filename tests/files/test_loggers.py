@@ -378,6 +378,8 @@ def test_rates_in_messages_are_rates_behind_files(tmp_path: Path):
     for rate in ("1.2.3Hz", "0Hz", "1e999Hz", "eHz", ".Hz"):
         with pytest.raises(InputError, match="is no rate"):
             all_of(f"{path}#{rate}")
+    with pytest.raises(InputError, match=r"takes .* of memory"):
+        open_table(f"{path}#1.7e308Hz").read([1, 2])
 
 
 def test_values_of_mdf_that_are_invalid_or_have_words(tmp_path: Path):
