@@ -61,9 +61,9 @@ class Piece(NamedTuple):
 
     def on_grid(self, values: Array) -> Array:
         """Values (rows of the file, columns) on the grid, straight lines between samples."""
-        first, last = int(self.rows[0]), int(self.rows[-1])
-        whole = last - first + 1 == len(self.rows)
-        found = values[first : last + 1] if whole else values[self.rows]
+        first, n = int(self.rows[0]) if len(self.rows) else 0, len(self.rows)
+        whole = not n or self.rows[-1] - first + 1 == n
+        found = values[first : first + n] if whole else values[self.rows]
         k = self._grid()
         if np.array_equal(k, self.places):
             return found
@@ -73,15 +73,15 @@ class Piece(NamedTuple):
     def missing(self) -> Booleans:
         """Whether there is no sample at or next to a point of the grid."""
         k = self._grid()
-        after = np.clip(np.searchsorted(self.places, k - 1e-6), 1, max(len(self.places) - 1, 1))
         if len(self.places) < 2:
             return np.zeros(len(k), bool)
+        after = np.clip(np.searchsorted(self.places, k - 1e-6), 1, len(self.places) - 1)
         before, behind = self.places[after - 1], self.places[after]
         wide = behind - before > _GAP * self.usual
         return wide & (k - before > 1e-6) & (behind - k > 1e-6)
 
     def _grid(self) -> Integers:
-        return np.arange(int(self.places[-1] + 1e-6) + 1)
+        return np.arange(int(self.places[-1] + 1e-6) + 1 if len(self.places) else 0)
 
 
 class EvenTimes(NamedTuple):

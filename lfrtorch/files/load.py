@@ -90,8 +90,11 @@ def load_records(
 
     Text (.csv, .tsv, .txt, .dat, .lvm, also .gz) with or without header, units line and preamble;
     MATLAB (.mat), .npz, .npy, HDF5 (.h5, .hdf5), Parquet and Excel (.xlsx, .xlsm); MDF4 (.mf4),
-    TDMS (.tdms), MCAP and ROS 2 bags (.mcap, .db3) and UFF58 (.uff, .unv), at one rate as
-    ``"drive.mf4#50Hz"``.
+    TDMS (.tdms), MCAP and ROS 2 bags (.mcap, .db3) and UFF58 (.uff, .unv). All but Excel may be
+    interpolated to a rate, as ``"drive.mf4#50Hz"`` or ``"x.csv#50Hz"``.
+
+    A file is one record. It is one for each of its runs if a column that is named as their number
+    is, as ``run`` or ``trial``, has each of its values in one stretch, or if the time begins again.
 
     What is cut off by a fraction begins where its record begins and is simulated from there: only
     its own part is scored, so that the transient of the start reaches neither validation nor test.
@@ -105,8 +108,9 @@ def load_records(
             Default: those whose names leave no doubt, as ``u``, or ``u1`` and ``u2``.
         outputs: likewise; by name ``y``, or ``y1`` and ``y2``.
         fs: sampling frequency in Hz. Default: from ``time``.
-        time: the column of time stamps, in seconds or as ISO date-times, evenly spaced. Default:
-            one that is named as time is, or a lone number like ``Fs`` in a file of arrays.
+        time: the column of time stamps, in seconds or as ISO date-times. Default: one that is named
+            as time is; or a lone number like ``Fs`` in a file of arrays; or another column that
+            rises evenly. Signals at uneven times are interpolated to even ones.
         units: of the channels by name or column number. Default: those in the file's header.
         validation: records that choose among iterates and are not fitted: a fraction below 1 of
             every record, the part after that for training; a number of records, the last ones;
@@ -127,7 +131,8 @@ def load_records(
             the input does not repeat. Of an estimated start nothing, and scores leave out the first
             50 samples, or a fifth of a shorter record.
         gaps: ``"error"`` refuses missing inputs and missing time stamps, and leaves outputs without
-            a value out of fits and scores (``Record.valid``); ``"split"`` makes a record of every
+            a value out of fits and scores (``Record.valid``); up to four samples in a row that the
+            times lack are filled so, the inputs on a line. ``"split"`` makes a record of every
             stretch between missing values of any kind.
         limits: least and greatest output that the sensors show, see :class:`lfrtorch.Record`; for
             example ``(None, 10)``.

@@ -166,7 +166,7 @@ def _stretches(
         u, y, r = (signals[:, part] for part in parts)
         if lost.any():
             y = np.where(lost[:, None], np.nan, y)
-        ends = [(0, len(u))]
+        ends = [(0, len(u))] if len(u) else []
         if gaps == "split":
             gone = lost | np.isnan(signals).any(axis=1)
             edges = np.flatnonzero(np.diff(np.concatenate([[True], gone, [True]]).astype(np.int8)))

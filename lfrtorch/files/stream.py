@@ -54,6 +54,11 @@ class FileStream:
         find_time: bool = False,
     ) -> None:
         self.table, self.fs = open_table(path), fs
+        if self.table.asked:
+            raise InputError(
+                f"'{path}': a file is simulated at the times that it has; leave out the rate "
+                "behind it, or in Python simulate a record of load_records(FILE, ..., test='all')."
+            )
         self.u = self._found(inputs, u, "inputs")
         there = {column.name for column in self.table.columns}
         self.missing = [channel.name for channel in y if channel.name not in there]

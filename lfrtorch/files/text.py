@@ -404,6 +404,13 @@ def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> L
         width -= 1  # every sample ends with a delimiter
         above = [line.cells for line in lines[:start] if len(line.cells) >= width]
     headers, units = _names(above, width)
+    names = lines[start - 1].cells if start and not above else []
+    if 1 < len(names) < width and not any(map(_is_missing, names)):
+        notes += (
+            f"line {lines[start - 1].number}, {brief(repr(delimiter.join(names)))}, has "
+            f"{len(names)} names for {width} columns and is not used: these are called "
+            f"{headers[0]!r} to {headers[-1]!r}",
+        )
     return Layout(
         encoding,
         delimiter,

@@ -15,6 +15,8 @@ import scipy.signal
 from lfrtorch import load_records
 from lfrtorch.excitation import multisine
 from lfrtorch.files import load
+from lfrtorch.files.formats import open_table
+from lfrtorch.files.glance import look_at
 from lfrtorch.files.text import TextTable
 from lfrtorch.linear.record_start import StartTrial
 from lfrtorch.records import Channel
@@ -190,6 +192,15 @@ def test_columns_without_a_header(tmp_path, signals):
     assert [c.name for c in data.train[0].inputs] == ["column 0", "column 1"]
 
 
+def test_a_header_of_too_few_names_is_said_not_to_be_used(tmp_path, signals):
+    path = write(tmp_path / "a.csv", signals, "u1,y")
+    data = load_records(path, inputs=[0, 1], outputs=2, fs=50.0, start="zero")
+    assert data.notes == (
+        "line 1, 'u1,y', has 2 names for 3 columns and is not used: these are called 'column 0' to "
+        "'column 2'",
+    )
+
+
 def test_other_columns_may_hold_text(tmp_path):
     rows = "".join(f"{i},12:00:{i:02d},{2 * i}\r\n" for i in range(60))
     path = tmp_path / "a.csv"
@@ -339,9 +350,9 @@ def test_dates_and_units_of_time(tmp_path, signals):
     table.assign(t=stamps.map(lambda stamp: stamp.isoformat())).to_csv(tmp_path / "a.csv")
     timed = np.hstack([signals, 20 * np.arange(SAMPLES)[:, None]])
     write(tmp_path / "b.csv", timed, "u1,u2,y,t (ms)")
-    for name in ("a.csv", "b.csv"):
+    for name, time in (("a.csv", "t"), ("a.csv", None), ("b.csv", "t")):
         data = load_records(
-            tmp_path / name, inputs=["u1", "u2"], outputs="y", time="t", start="zero"
+            tmp_path / name, inputs=["u1", "u2"], outputs="y", time=time, start="zero"
         )
         assert data.train[0].fs == 50.0
         assert np.array_equal(joined(data.tests[0]), signals)
@@ -425,6 +436,8 @@ def test_no_sampling_frequency(tmp_path):
     data = load_records(path, **BARE)
     assert data.train[0].fs == 20.0
     assert data.notes[0] == "the column 'x' is taken for the time, 20 Hz"
+    seen = look_at(open_table(path), "u", "y")  # a first look has the same rule
+    assert (seen.fs, seen.remarks) == (20.0, ["the column 'x' is taken for the time, 20 Hz"])
     write(path, both[:, [0, 2, 3]], "n,u,y")
     refused(r"is not known; give fs=HZ\.$", path, use=BARE)
     write(path, both[:, [3, 2, 3]], "t,u,y")
@@ -708,6 +721,12 @@ def test_stretches_between_gaps_are_records(tmp_path):
     assert [len(r) for r in (data.train, data.validation, data.tests)] == [1, 1, 1]
     assert data.tests[0].samples == 152
     refused("no run or stretch between gaps is long", path, use=TIMED, gaps="split", skip=148)
+
+
+def test_a_file_without_values_is_refused(tmp_path):
+    path = write(tmp_path / "a.csv", np.c_[np.arange(50), np.full((50, 2), np.nan)], "n,u,y")
+    for gaps in ("error", "split"):
+        refused("no sample in which all columns", path, use=BARE, fs=1.0, gaps=gaps)
 
 
 def test_empty_lines_at_the_end_are_no_gap(tmp_path, signals):
@@ -1055,6 +1074,15 @@ def test_columns_that_are_not_used_are_looked_at_together(tmp_path, monkeypatch)
     with pytest.raises(ValueError, match="give fs=HZ"):
         load_records(tmp_path / "a.csv", inputs="c0", outputs="c1", start="zero")
     assert len(passes) == 1
+
+
+def test_a_column_of_dates_is_the_time_whatever_its_name(tmp_path, signals):
+    stamps = pd.date_range("2024-12-31T23:59:58", periods=SAMPLES, freq="1s")
+    table = pd.DataFrame(signals, columns=["u1", "u", "y"])
+    table.assign(begun=stamps.map(lambda stamp: stamp.isoformat())).to_csv(tmp_path / "a.csv")
+    data = load_records(tmp_path / "a.csv", **BARE, test="all")
+    assert data.notes[0] == "the column 'begun' is taken for the time, 1 Hz"
+    assert look_at(open_table(tmp_path / "a.csv"), "u", "y").remarks == [data.notes[0]]
 
 
 def test_a_clock_among_columns_of_text_is_the_time(tmp_path):

@@ -153,6 +153,10 @@ def test_a_sample_that_is_repeated(samples: int, tmp_path: Path):
     refused(said, path, samples=samples, time="t")
 
 
+def test_a_rate_behind_the_file_is_refused(tmp_path: Path):
+    refused("is simulated at the times that it has", Path(f"{timed(tmp_path, TIMES)}#750Hz"))
+
+
 def test_a_parquet_file_is_not_read_ahead(tmp_path: Path):
     pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     n, groups = 10_000, 40
