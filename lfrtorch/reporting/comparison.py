@@ -162,7 +162,7 @@ class Comparison:
 
     def figures(self, record: Record | None = None) -> dict[str, Figure]:
         """Errors against parameters, boxes of each setting, simulations of a record, by name."""
-        drawn = {"parameters": self._by_parameters()}
+        drawn = {"parameters": self._by_parameters()} if len(self.runs) > 1 else {}
         if self.settings and self.front:  # boxes need finite errors
             drawn["seeds"] = self._boxes()
         simulated = {} if record is None else self.simulations(record := with_window(record))
@@ -202,7 +202,7 @@ class Comparison:
             ([run.parameters for run in runs], [factor * run.error for run in runs])
             for runs in (self.runs, self.front)
         )
-        ax.plot(*points, ".", color=NL_LFR, alpha=0.6)
+        ax.plot(*points, ".", color=NL_LFR, alpha=0.6, label="runs")
         ax.step(*front, where="post", color=OUTPUT, lw=1, label="fewest parameters for the error")
         ax.legend()
         self._label(ax.yaxis)

@@ -107,7 +107,7 @@ class TensorBoard:
     ) -> None:
         """Add the run to the page HParams, where many runs are compared."""
         shown = {k: v for k, v in settings.items() if isinstance(v, bool | int | float | str)}
-        values = {f"found/{k}": v for k, v in found.items() if v is not None}
+        values = {f"total/{k}": v for k, v in found.items() if v is not None}
         for summary in hparams(shown, values):
             self._write(step, lambda writer, one=summary: _file(writer).add_summary(one))
         for name, value in values.items():

@@ -79,7 +79,8 @@ def density(record: Record, simulated: Simulated, outputs: Sequence[int] | None 
             ax.plot(f[1:], level[1:], style, color=colour, label=label)
         output = record.outputs[i]
         per = f"{factor_of(output.unit)}²{'/Hz' * (record.fs != 1.0)}" if output.unit else ""
-        ax.set(ylabel=f"{output.name} (dB{reference(per)})", xlim=(0, record.fs / 2))
+        ax.set(ylabel=f"{output.name} (dB{reference(per)})", xscale="log")
+        ax.margins(x=0)
         legend_above(ax)
     _frequency_axis(record, figure.axes[-1])
     return figure

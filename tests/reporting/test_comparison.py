@@ -198,7 +198,8 @@ def test_the_best_run_of_each_setting_simulates_the_record(runs: Path):
 def test_models_of_other_channels_are_left_out(runs: Path):
     (found,) = comparison.compare([runs])
     assert not found.simulations(RECORD)
-    assert "close_up" not in found.figures(RECORD)
+    assert found.figures(RECORD).keys() == {"parameters", "seeds"}
+    assert comparison.Comparison("alone", found.runs[:1]).figures(RECORD) == {}
 
 
 def test_settings_that_are_alike_in_their_first_letters_stay_apart(runs: Path, tmp_path: Path):

@@ -194,6 +194,7 @@ def test_sizes_that_were_tried(single: Run):
     page = single.page(search=[runs_away, large, entry, less])
     assert "1 1 3 0.0100 19 0.520 0 chosen 1 1 9 0.100 37 0.600 0" in page.text
     assert "4 models were tried; the table has each size with its best ridge." in page.text
+    assert page.tags.count("details") == 4  # sizes, poles, parameters, configuration
     assert "Sizes" not in single.page().text
 
 

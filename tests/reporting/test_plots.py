@@ -141,6 +141,8 @@ def test_density_integrates_to_the_power():
         level = 10 * np.log10(np.mean(10 ** (line[:, 1] / 10)))
         assert level == pytest.approx(10 * np.log10(scale**2 * 2 / 100), abs=0.25)
     assert "dB, re 1 m²/Hz" in ax.get_ylabel()
+    assert ax.get_xscale() == "log"
+    assert ax.get_xlim() == pytest.approx((line[0, 0], 50.0))
     short = Record(y[:10], y[:10], skip=5)
     assert len(drawn(plots.density(short, both(0 * y[:10], y[:10])).axes[0], "output")) == 2
 
