@@ -366,8 +366,9 @@ def _local_polynomial(
     )
     if not determined.any():
         raise InputError(
-            "the inputs determine the response at no line: they depend on each other, or excite "
-            "too few lines; use richer inputs, another band or a lower order."
+            "the inputs determine the response at no line: they depend on each other, excite too "
+            "few lines, or follow the reference less than noise; use richer inputs, another band "
+            "or a lower order."
         )
     notes = [
         "noise: not told apart from nonlinear distortion without periods; two or more periods of "
@@ -379,7 +380,10 @@ def _local_polynomial(
             f"frequency response: the records were cut to the shortest one, {spectra.N} samples."
         )
     if not determined.all():
-        notes.append(f"{np.sum(~determined)} line(s) are left out: the inputs do not determine G.")
+        weak = "" if outputs is None else ", or follow the reference less than noise"
+        notes.append(
+            f"{np.sum(~determined)} line(s) are left out: the inputs do not determine G{weak}."
+        )
     return FRF(
         spectra.frequencies(lines[determined]),
         G[determined],

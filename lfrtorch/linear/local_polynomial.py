@@ -15,7 +15,23 @@ import numpy as np
 from jaxtyping import Bool, Complex128, Float, Int64
 
 from lfrtorch._support.types import Array, Booleans, Complex, Integers
-from lfrtorch.linear.regression import DEPENDENT, covariance, divided, outer, regress
+from lfrtorch.linear.regression import (
+    DEPENDENT,
+    Regression,
+    covariance,
+    divided,
+    outer,
+    regress,
+)
+from lfrtorch.linear.spectra import NOISE_LINES, smoothed
+
+FOLLOWING = 10.0
+"""Power of the inputs that follows a reference at an excited line, relative to its error: 10 dB.
+The ratio of the responses of y and u has a bias of exp(-10) there."""
+
+STRONGER = 100.0
+"""Power of the input at lines that tell the noise at a weaker one, relative to it: 20 dB. With
+10 dB the models of chirps and steps in a loop are as good."""
 
 CHUNK = 2**21
 """Complex numbers of the windows that are in memory at a time: 32 MiB, and as many in copies."""
@@ -103,6 +119,12 @@ def fit_local_polynomials(
     The records share g, and each has its own t. A projection across all polynomials of the order,
     the same for all windows, removes t. The result is g_0 = G(k).
 
+    Where nothing else excites the input, a controller makes it from the noise. There G becomes one
+    over the controller and leaves no residual, which so tells nothing of the error. With a
+    reference (as U; Y holds ``outputs``, then the inputs) these lines are not determined. Without
+    one the noise where the input is weak is at least that where it is strong, times the lines of a
+    window, as what the controller makes is common to them.
+
     References:
         Pintelon and Schoukens, "System Identification: A Frequency Domain Approach", 2nd ed.,
         2012, chapter 7.
@@ -127,16 +149,45 @@ def fit_local_polynomials(
         shape = len(window), rows, -1
         fitted = regress(X.reshape(shape), projected.reshape(shape), nu)
         alone = np.sum(np.abs(fitted.weights) ** 2, axis=2)
+        excited = np.ones(len(window))
         if outputs is not None:
+            excited = _following(fitted, outputs, freedom)
             fitted = divided(fitted, outputs)
         C = outer(fitted.residual) / freedom
         # If one line alone has power, some columns are rounding errors, which pass as independent.
         sizes = np.linalg.norm(X, axis=(1, 2))  # (line, s, input)
         determined = (sizes > DEPENDENT * sizes.max(axis=1, keepdims=True)).all(axis=(1, 2))
         weights = fitted.weights.reshape(len(window), nu, records, -1) @ complement.T
-        cov = covariance(C, fitted.weights)
-        parts.append((fitted.G, cov, fitted.determined & determined, weights, C, alone))
+        parts.append((fitted.G, fitted.determined & determined, excited, weights, C, alone))
     joined = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    G, cov, determined, weights, noise, alone = joined
+    G, determined, excited, weights, noise, alone = joined
+    if outputs is None:
+        noise = noise + width * _noise_of_stronger(noise, weights, determined)
+    else:  # noise alone passes now and then, and most of the lines about it do not
+        determined &= smoothed(excited[:, None], NOISE_LINES)[:, 0] > 0.5
+    cov = covariance(noise, weights.reshape(len(first), nu, -1))
     errors = WindowErrors(first, weights, noise, None if outputs is None else alone)
     return G, cov, determined, errors
+
+
+def _following(fitted: Regression, ny: int, freedom: int) -> Booleans:
+    """Tell at which lines the inputs, the last columns of Y, follow X beyond the noise."""
+    G = fitted.G[:, ny:]
+    A = fitted.weights @ fitted.weights.conj().swapaxes(1, 2)
+    A = np.where(fitted.determined[:, None, None], A, np.eye(G.shape[2]))
+    power = G @ np.linalg.solve(A.swapaxes(1, 2), G.conj().swapaxes(1, 2))
+    noise = outer(fitted.residual[:, :, ny:]) / freedom
+    beyond = np.linalg.eigvalsh(power - FOLLOWING * noise)
+    return np.asarray(beyond[:, 0] > 0)
+
+
+def _noise_of_stronger(noise: Complex, weights: Complex, determined: Booleans) -> Complex:
+    """Mean noise (F, ny, ny) where the inputs are stronger than at each line, 0 if nowhere."""
+    power = determined[:, None] / np.sum(np.abs(weights) ** 2, axis=(2, 3))
+    power = (power / np.maximum(power.max(axis=0), 1e-300)).min(axis=1)
+    order = np.argsort(-power, kind="stable")
+    ranked = power[order]
+    sums = np.cumsum(ranked[:, None, None] * noise[order], axis=0)
+    means = sums / np.maximum(np.cumsum(ranked), 1e-300)[:, None, None]
+    stronger = np.searchsorted(-ranked, -STRONGER * power)
+    return np.where(stronger[:, None, None] > 0, means[np.maximum(stronger - 1, 0)], 0.0)

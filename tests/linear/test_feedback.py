@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from reference import frf
+from scipy import signal
 
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.excitation import multisine
@@ -214,6 +215,50 @@ def test_noise_of_a_periodic_input_leaves_no_bias_in_a_model(realisations: int, 
     runs = input_noise(40, realisations, P, 0.3)
     found = [response(estimate_bla(records, 2, feedthrough=False)) for records in runs]
     assert bias(found, truth(OMEGA))[1] < LARGEST
+
+
+def excited_in_a_band(level: float, *, chirp: bool) -> Record:
+    """Loop whose reference leaves most lines without power, or with little."""
+    T = 1500
+    r = signal.chirp(np.arange(T), 0.01, T, 0.15)
+    if not chirp:
+        r = 2 * signal.lfilter(*signal.butter(2, 0.1), np.random.default_rng(4).normal(size=T))
+    r = r[None, :, None]
+    u, y = loop(r, coloured(np.random.default_rng(3), r.shape, level))
+    return Record(u[0], y[0], reference=r[0])
+
+
+@pytest.mark.parametrize("chirp", [True, False])
+@pytest.mark.parametrize("level", [0.005, 0.05])
+def test_lines_without_excitation_do_not_count(level: float, chirp: bool):
+    """The noise there, which the controller feeds back, made models of another kind."""
+    record = excited_in_a_band(level, chirp=chirp)
+    omega = np.linspace(0.1, 0.9, 30)
+    true = truth(omega)
+    for given in (record, *without([record])):
+        model = estimate_bla(given, 2, refine="frequency")
+        system = model.A, model.B, model.C, model.D
+        error = np.sqrt(np.mean(np.abs(frf(system, omega)[:, 0, 0] - true) ** 2))
+        # Fits to all samples leave 0.4 and 0.6 times the level.
+        assert error < 1.5 * level * np.sqrt(np.mean(np.abs(true) ** 2))
+
+
+@pytest.mark.parametrize("level", [0.005, 0.05])
+def test_the_variance_is_large_where_a_chirp_does_not_excite(level: float):
+    """Of the response from the input; that from the reference has no lines there."""
+    record = excited_in_a_band(level, chirp=True)
+    estimate = estimate_frf(without([record]))
+    omega = 2 * np.pi * estimate.frequencies
+    assert len(omega) == 749
+    assert estimate.var_total is not None
+    error = np.abs(estimate.G[:, 0, 0] - truth(omega)) ** 2 / estimate.var_total[:, 0, 0]
+    beside = (omega < 0.05) | (omega > 1.0)
+    assert np.median(error[~beside]) < 2.0
+    assert np.median(error[beside]) < 2.0  # 1e10 from the residuals
+    known = estimate_frf(record)
+    assert known.frequencies.max() < 0.16
+    assert len(known.frequencies) > 150
+    assert known.notes[-1].endswith("or follow the reference less than noise.")
 
 
 def test_references_of_some_records_alone_are_refused():
