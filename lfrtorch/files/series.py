@@ -9,7 +9,6 @@ different rates are refused together, unless the path ends in a rate for all: ``
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array
-from lfrtorch.files.table import BLOCK, Table
+from lfrtorch.files.table import BLOCK, Table, rate_behind
 
 _UNEVEN = 0.01
 """Of a step, that a time may be off an even clock."""
@@ -38,8 +37,6 @@ _FEW = 10
 
 _SLOWER, _FAR = 2, 20
 """Times that a channel on change is slower than another one: at least, and without other signs."""
-
-_RATE = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*(k?)Hz", re.IGNORECASE)
 
 
 class Series(NamedTuple):
@@ -186,10 +183,10 @@ class SeriesTable(Table):
 
 def _asked(text: str) -> float:
     """The rate that stands behind a file."""
-    found = _RATE.fullmatch(text.strip())
-    if found is None or not 0 < float(found[1]) < np.inf:
+    fs = rate_behind(text)
+    if fs is None:
         raise InputError(f"'#{text}' behind the file is no rate; write #50Hz, for example.")
-    return float(found[1]) * (1000.0 if found[2] else 1.0)
+    return fs
 
 
 def _in_order(series: Series) -> Series | str:

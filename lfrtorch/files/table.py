@@ -37,7 +37,7 @@ _SIDES = {
 _Row = TypeVar("_Row")
 
 _ALL, _SOME = 24, 20  # columns: up to which a message names all, and of more
-_RATE = re.compile(r"([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*(k?)Hz", re.IGNORECASE)
+_RATE = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*(k?)Hz", re.IGNORECASE)
 _NAME = 60  # characters of a column's name in a list
 
 
