@@ -196,7 +196,7 @@ class Known:
         if others and len(others) != len(left):
             raise InputError(
                 f"the known model has {len(names)} state(s), {', '.join(names)}, and the data have "
-                f"{len(outputs)} output(s), {', '.join(outputs)}; call outputs as the states that "
+                f"{len(outputs)} output(s), {', '.join(outputs)};\ncall outputs as the states that "
                 "they are, or give outputs=, a function of (x, u, p) that returns a value for each "
                 f"output, for instance lambda x, u, p: (x.{names[0]},)."
             )

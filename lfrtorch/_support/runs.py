@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from lfrtorch._support.types import Array, Integers
 
-_NAMES = re.compile(
-    r"(run|exp|experiment|trial|test|episode|session|segment|sequence|recording|record|sweep|lap"
-    r"|batch|flight|manoeuvre|maneuver|file|versuch|messung|lauf)s?"
-    r"([ _.-]?(id|no|nr|num|number|index|idx|name))?|id",
-    re.IGNORECASE,
+_WORDS = (
+    *("run", "exp", "experiment", "trial", "test", "episode", "session", "segment", "sequence"),
+    *("recording", "record", "sweep", "lap", "batch", "flight", "manoeuvre", "maneuver", "file"),
+    *("versuch", "messung", "lauf"),
 )
+_ENDINGS = "id", "no", "nr", "num", "number", "index", "idx", "name"
+_NAMES = re.compile(rf"({'|'.join(_WORDS)})s?([ _.-]?({'|'.join(_ENDINGS)}))?|id", re.IGNORECASE)
 _LEAST = 20  # samples of most runs
 _AGAIN = 10  # steps: so much later than the one before a run may begin
 

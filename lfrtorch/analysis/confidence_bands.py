@@ -548,9 +548,9 @@ def _clipped(
     if errors < _SHIFTED:
         return ()
     return (
-        "noise is not small beside the limits of the sensor: they cut it off on one side, which "
+        "noise is not small beside the limits of the sensor: they cut it off on one side,\nwhich "
         f"shifts the fit by some {number(errors, 2)} standard errors, which errors and bands do "
-        "not know; a sensor of more range or less noise helps.",
+        "not know;\na sensor of more range or less noise helps.",
     )
 
 

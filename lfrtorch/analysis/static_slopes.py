@@ -36,7 +36,7 @@ def infinite_slope(model: Model, records: Sequence[Record]) -> str:
         by = "a parameter" if j >= cell.nz else f"{by}, which is {value}"
         return (
             f"the derivative of {of} is not finite in sample {k} of record '{record.name}', by "
-            f"{by}; a root, a logarithm and a division have none at 0: keep away from it, "
+            f"{by};\na root, a logarithm and a division have none at 0: keep away from it, "
             "as in torch.sqrt(level.clamp(min=1e-6)), or choose by torch.where"
         )
     return ""

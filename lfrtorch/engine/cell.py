@@ -213,7 +213,7 @@ class LFRCell(nn.Module):
             if name not in weights:
                 raise InputError(
                     f"{name} is no parameter any more, as of a parametrisation or a pruning; the "
-                    "equations need it as it is. A static map of torch's own layers may have one: "
+                    "equations need it as it is.\nA static map of torch's own layers may have one: "
                     "static=torch.nn.Sequential(...)."
                 )
             found = tuple(weights[name].shape)

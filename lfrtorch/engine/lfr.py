@@ -120,7 +120,7 @@ class LFR(nn.Module):
         if torch.onnx.is_in_onnx_export() or torch.compiler.is_compiling():
             raise InputError(
                 "an LFR runs in machine code, which torch.export and torch.onnx.export cannot "
-                "follow; lfrtorch.export.write(model, 'onnx', FOLDER) writes a lfrtorch.Model, "
+                "follow;\nlfrtorch.export.write(model, 'onnx', FOLDER) writes a lfrtorch.Model, "
                 "which has such a layer."
             )
         if self.cell.autocast:

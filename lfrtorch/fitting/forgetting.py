@@ -55,6 +55,12 @@ class Memory(NamedTuple):
         linear: the same of the linear model; 0 if there is none.
         visited: whether trajectories that stay apart end at states that the records have visited:
             the system has several rests.
+
+    Example:
+        >>> print(lfrtorch.Memory(apart=0.001))
+        The model forgets where it began.
+        >>> lfrtorch.Memory(apart=0.5, linear=0.4).fades  # lightly damped: the linear model is slow
+        True
     """
 
     apart: float
@@ -86,7 +92,7 @@ class Memory(NamedTuple):
         return f"The model does not forget where it began: {text}, where the records never were."
 
 
-@typed("model", "records", "linear")
+@typed("records")
 def forgets(
     model: Model, records: Record | Sequence[Record], linear: LinearModel | Model | None = None
 ) -> Memory:

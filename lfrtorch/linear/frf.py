@@ -367,7 +367,7 @@ def _local_polynomial(
     if not determined.any():
         raise InputError(
             "the inputs determine the response at no line: they depend on each other, excite too "
-            "few lines, or follow the reference less than noise; use richer inputs, another band "
+            "few lines, or follow the reference less than noise;\nuse richer inputs, another band "
             "or a lower order."
         )
     notes = [

@@ -414,9 +414,9 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
                 yield Note(
                     f"delay {name} {j}",
                     f"a dead time of about {delay} samples{lasting} from input "
-                    f"'{found.inputs[j].channel.name}' to output '{name}', beside the one sample "
-                    "of any system without feedthrough: shift the output by it, or a model spends "
-                    "as many states on it.",
+                    f"'{found.inputs[j].channel.name}' to output '{name}', beside that of one "
+                    "sample which any system without feedthrough has:\nshift the output by it, or "
+                    "a model spends as many states on it.",
                 )
         if not integrates:
             yield from _drift(output, y[:, i], u)

@@ -238,7 +238,7 @@ def test_a_run_predicts():
     own, linear = (lfrtorch.rmse(test, m.predict(test)) for m in (run.model, run.linear))
     assert own < 0.9 * linear
     assert own < 1.1 * rms(e[620:])
-    assert "prediction error" in run.verdict.text
+    assert "the errors 1, 10 and 100 samples ahead are" in run.verdict.text
 
 
 @pytest.mark.parametrize(
