@@ -49,7 +49,8 @@ def rmse_by_output(record: Record, y_hat: Array) -> Array:
 def nrmse(record: Record, y_hat: Array) -> float:
     """RMSE over the standard deviation of the measured output, both over the scored samples.
 
-    NaN for an output that is constant there.
+    Several outputs are each taken over their own deviation: the root mean square of theirs, without
+    those that are constant there. NaN if none is left.
 
     Example:
         >>> lfrtorch.nrmse(record, bla.simulate(record)) < 0.3
@@ -57,8 +58,12 @@ def nrmse(record: Record, y_hat: Array) -> float:
     """
     outputs = [y[there] for y, there in zip(record.y.T, record.scored.T, strict=True)]
     # About the first sample, so that those of a constant are 0: its mean has rounding errors.
-    deviation = float(np.sqrt(np.mean([np.var(y - y[0]) for y in outputs if len(y)])))
-    return rmse(record, y_hat) / deviation if deviation > 0 else float("nan")
+    deviations = np.array([np.std(y - y[0]) if len(y) else 0.0 for y in outputs])
+    rmse(record, y_hat)  # refuses other shapes
+    moved = deviations > 0
+    if not moved.any():
+        return float("nan")
+    return float(rms(rmse_by_output(record, y_hat)[moved] / deviations[moved]))
 
 
 class BlockScores:

@@ -56,6 +56,14 @@ def common_unit(channels: Sequence[Channel]) -> str:
     return units.pop() if len(units) == 1 else ""
 
 
+def of_one_unit(channels: Sequence[Channel]) -> bool:
+    """Return whether all channels have one unit: errors of several have no sum but a relative one.
+
+    A channel without a unit has another one than a channel with one.
+    """
+    return len({channel.unit for channel in channels}) == 1
+
+
 @dataclass(frozen=True, eq=False)
 class Record:
     """One measurement: input, output, and how it is to be simulated and scored.

@@ -30,7 +30,12 @@ def test_outputs_count_alike():
     record = Record(y, y)
     y_hat = y + np.array([3.0, 4.0])
     assert rmse(record, y_hat) == pytest.approx(np.sqrt((9 + 16) / 2))
-    assert nrmse(record, y_hat) == pytest.approx(np.sqrt(25 / (1 + 4)))
+    assert nrmse(record, y_hat) == pytest.approx(np.sqrt((9 / 1 + 16 / 4) / 2))
+    in_other_units = np.array([1e-9, 1e9])
+    scaled = Record(y, y * in_other_units)
+    assert nrmse(scaled, y_hat * in_other_units) == pytest.approx(nrmse(record, y_hat))
+    still = Record(y, np.column_stack([y[:, 0], np.ones(4)]))
+    assert nrmse(still, np.column_stack([y_hat[:, 0], np.ones(4)])) == pytest.approx(3.0)
 
 
 def test_exact_simulation_scores_zero():
@@ -104,5 +109,5 @@ def test_samples_that_are_not_valid_are_not_scored():
     assert rmse(record, y_hat) == pytest.approx(np.sqrt(np.mean((y - y_hat)[counts] ** 2)))
     each = [np.sqrt(np.mean((y - y_hat)[counts[:, i], i] ** 2)) for i in range(2)]
     assert rmse_by_output(record, y_hat) == pytest.approx(each)
-    deviation = np.sqrt(np.mean([np.var(y[counts[:, i], i]) for i in range(2)]))
-    assert nrmse(record, y_hat) == pytest.approx(rmse(record, y_hat) / deviation)
+    relative = [error / np.std(y[counts[:, i], i]) for i, error in enumerate(each)]
+    assert nrmse(record, y_hat) == pytest.approx(np.sqrt(np.mean(np.square(relative))))

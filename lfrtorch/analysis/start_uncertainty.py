@@ -25,7 +25,7 @@ from lfrtorch.engine.linear_recurrence import linear_recurrence
 from lfrtorch.engine.linearised import linearise
 from lfrtorch.engine.operating_point import double
 from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.records import Record, of_one_unit
 
 LONGEST = 1 << 13
 """Samples at the beginning of a record whose free responses are computed."""
@@ -33,9 +33,10 @@ LONGEST = 1 << 13
 
 @torch.no_grad()
 def start_error(model: Model, record: Record, y_hat: Float[Array, "T ny"]) -> float | None:
-    """RMS error, physical units, that the uncertainty of the start state adds in scored samples.
+    """RMS error that the uncertainty of the start state adds in scored samples.
 
-    None if no start state is estimated from skipped samples, or from too many.
+    In physical units, of outputs of several units normalised. None if no start state is estimated
+    from skipped samples, or from too many.
     """
     N, T = record.skip, min(record.samples, LONGEST)
     if record.start != "estimated" or not 0 < N <= LONGEST // 2 or not np.isfinite(y_hat).all():
@@ -54,7 +55,8 @@ def start_error(model: Model, record: Record, y_hat: Float[Array, "T ny"]) -> fl
     covariance = covariance @ covariance.T
     for g, e in zip(G.reshape(len(G), N, -1).transpose(2, 0, 1), errors.T, strict=True):
         covariance += g @ matmul_toeplitz(_autocovariance(e, N), g.T)
-    added = np.einsum("kil,lm,kim->ki", free[N:], covariance, free[N:]) * scale**2
+    added = np.einsum("kil,lm,kim->ki", free[N:], covariance, free[N:])
+    added *= scale**2 if of_one_unit(record.outputs) else 1.0
     count = record.samples - N
     squares = added.sum(axis=0) + (count - len(added)) * added[-1]
     return float(np.sqrt(squares.mean() / count))

@@ -106,8 +106,9 @@ class Progress:
     Args:
         iteration: 0 is the start.
         limit: most iterations.
-        train, validation: root mean squared simulation errors, output unit; validation is NaN
-            if there is no validation record or the model diverges on it.
+        train, validation: root mean squared simulation errors, output unit (normalised if outputs
+            have several); validation is NaN if there is no validation record or the model diverges
+            on it.
         seconds: since the start of the fit.
         best: whether this iterate is the best so far, on validation if there is one.
         report: scalars of the trainer.

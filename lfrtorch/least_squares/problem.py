@@ -27,7 +27,7 @@ from lfrtorch.least_squares.ridge import Ridge, RidgePenalty, ridge_by_entry
 from lfrtorch.least_squares.simulation_errors import SimulationErrors, SystemErrors
 from lfrtorch.least_squares.term import Term
 from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.records import Record, as_records, of_one_unit
 
 BATCH = 32
 """Records in a minibatch, about."""
@@ -149,7 +149,10 @@ class Problem(LeastSquares):
             self._terms.append(RidgePenalty(weight, self._theta_0))
 
     def rmse(self, theta: Float[Tensor, " P"]) -> float:
-        """RMSE at θ over scored samples and outputs, unweighted, in output units, as in a score."""
+        """RMSE at θ over scored samples and outputs, unweighted, as in a score.
+
+        In the unit of the outputs; of several units each in that of the scaling, about its rms.
+        """
         return self.errors.rmse(theta)
 
     def cost(self, residual: Float[Tensor, " M"]) -> float:
@@ -300,7 +303,7 @@ def _errors_of(
         model.lfr.cell,
         [model.scaler.normalise(record) for record in data],
         ranks,
-        y_scale=model.scaler.y_scale,
+        y_scale=model.scaler.y_scale if of_one_unit(model.outputs) else 1.0,
         solve_initial_states=solve_initial_states,
     )
 

@@ -17,7 +17,7 @@ from lfrtorch.dataset import Dataset
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import nrmse, rmse, rmse_by_output
 from lfrtorch.model import Model
-from lfrtorch.records import Channel, Record, without_coordinates
+from lfrtorch.records import Channel, Record, of_one_unit, without_coordinates
 from lfrtorch.reporting.opponent import Opponents, output
 from lfrtorch.score_window import fitted
 
@@ -43,10 +43,10 @@ class Score:
     samples: int
     skip: int  # samples at the beginning that do not count
     scored: int  # how many do
-    rmse: float | None  # of the NL-LFR; None without one
+    rmse: float | None  # of the NL-LFR; None without one; of outputs of several units the nrmse
     lti_rmse: float | None  # of the linear model
-    std: float  # standard deviation of the measured output over the scored samples
-    nrmse: float | None  # rmse / std
+    std: float  # of the measured output over the scored samples; 1 of several units
+    nrmse: float | None  # rmse / std, each output's own
     rmse_by_output: tuple[float, ...]
     lti_rmse_by_output: tuple[float, ...]
     std_by_output: tuple[float, ...]
@@ -121,7 +121,8 @@ class Response:
     def score(self) -> Score:
         """Errors of both models; the record says which samples are scored."""
         record, outputs = self.record, self.simulated.items()
-        errors = {name: rmse(record, y) for name, y in outputs}
+        alike = of_one_unit(record.outputs)
+        errors = {name: (rmse if alike else nrmse)(record, y) for name, y in outputs}
         by_output = {name: tuple(rmse_by_output(record, y).tolist()) for name, y in outputs}
         counted = [y[there] for y, there in zip(record.y.T, record.scored.T, strict=True)]
         std = [float(np.std(y - y[0])) if len(y) else math.nan for y in counted]
@@ -135,7 +136,7 @@ class Response:
             scored=record.scored_samples,
             rmse=errors.get(_NL_LFR),
             lti_rmse=errors.get(_LINEAR),
-            std=float(np.sqrt(np.mean(known))) if len(known) else math.nan,
+            std=(float(np.sqrt(np.mean(known))) if len(known) else math.nan) if alike else 1.0,
             nrmse=nrmse(record, self.y_hat) if _NL_LFR in errors else None,
             rmse_by_output=by_output.get(_NL_LFR, ()),
             lti_rmse_by_output=by_output.get(_LINEAR, ()),
@@ -304,11 +305,13 @@ def _together(scores: Sequence[Score]) -> Score:
         return tuple(np.mean([getattr(s, f"{name}_by_output") for s in scores], axis=0).tolist())
 
     errors = {name: each(name) for name in ("rmse", "lti_rmse", "std")}
+    alike = of_one_unit(scores[0].channels)
+    joint = {n: e if alike else [getattr(s, n) for s in scores] for n, e in errors.items()}
     return replace(
         scores[0],
-        rmse=mean(errors["rmse"]) if errors["rmse"] else None,
-        lti_rmse=mean(errors["lti_rmse"]) if errors["lti_rmse"] else None,
-        std=float(np.mean(errors["std"])),
+        rmse=mean(joint["rmse"]) if errors["rmse"] else None,
+        lti_rmse=mean(joint["lti_rmse"]) if errors["lti_rmse"] else None,
+        std=float(np.mean(joint["std"])),
         nrmse=mean([s.nrmse for s in scores]),
         start_error=mean([s.start_error for s in scores]),
         records=len(scores),

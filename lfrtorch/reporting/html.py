@@ -38,6 +38,7 @@ from lfrtorch.reporting.score_columns import (
     Row,
     columns,
     in_units,
+    joint_unit,
     of_samples,
     rows_of,
     start_matters,
@@ -162,10 +163,11 @@ def _scores(metrics: Mapping[str, Any], evaluation: Evaluation) -> dict[str, Any
     references = [own_linear(metrics)] if metrics["linear"] else []
     references += [f"{p.label}: {p.reference}" for p in published if of_tests]
     references += [
-        f"{name}: the uncertainty of its start state adds {quantity(s['start_error'], s['unit'])} "
-        f"to the NL-LFR's error of {quantity(s['rmse'], s['unit'])}"
+        f"{name}: the uncertainty of its start state adds {quantity(s['start_error'], unit)} to "
+        f"the NL-LFR's error of {quantity(s['rmse'], unit)}"
         for name, s in (metrics["scores"] | metrics["validation"]["records"]).items()
         if start_matters(s)
+        for unit in (joint_unit(s),)
     ]
     return {
         "unit": "" if len(evaluation.dataset.train[0].outputs) > 1 else rows[0].unit,

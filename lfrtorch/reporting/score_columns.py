@@ -138,6 +138,11 @@ def of_samples(score: Mapping[str, Any]) -> str:
     return f"{'last ' * bool(last)}{scored} of {samples}"
 
 
+def joint_unit(score: Mapping[str, Any]) -> str:
+    """The unit of the error of all outputs together; none of several units: it is relative."""
+    return "" if ", " in score["unit"] else score["unit"]
+
+
 def start_matters(score: Mapping[str, Any]) -> bool:
     """Whether the uncertainty of the start state makes a part of the error that is seen."""
     added, error = score["start_error"], score["rmse"]

@@ -21,7 +21,7 @@ from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.records import common_unit
 from lfrtorch.reporting.evaluation import HORIZONS, Evaluation
-from lfrtorch.reporting.score_columns import Row, columns, in_units
+from lfrtorch.reporting.score_columns import Row, columns, in_units, joint_unit
 from lfrtorch.reporting.verdict import Verdict
 
 ERRORS = "rmse", "lti_rmse"
@@ -163,7 +163,7 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     sizes, shown = result["sizes"], f"nx {result['sizes']['nx']}, a linear model"
     others = [p for p in published if p.sizes in (None, (sizes["nz"], sizes["nw"]))]
     rows = [
-        Row(line, name, s, "", s["unit"], of["lti_rmse"], math.nan if e is None else e)
+        Row(line, name, s, "", joint_unit(s), of["lti_rmse"], math.nan if e is None else e)
         for part in (result["scores"], result["validation"]["records"])
         for name, s in part.items()
         for line, of in lines(name, s, others)
@@ -265,7 +265,7 @@ def own_linear(result: Mapping[str, Any]) -> str:
 def unit_of(result: Mapping[str, Any]) -> str:
     """The unit of all errors in what :func:`metrics` returns; none if there are several."""
     listed = [*result["scores"].values(), *result["validation"]["records"].values()]
-    units = {s["unit"] for s in listed} - {""}
+    units = {joint_unit(s) for s in listed} - {""}
     return units.pop() if len(units) == 1 else ""
 
 

@@ -14,7 +14,7 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
-from lfrtorch.records import Record, Start
+from lfrtorch.records import Channel, Record, Start
 
 pytestmark = pytest.mark.numeric
 
@@ -528,6 +528,23 @@ def test_minibatches_are_the_whole_in_parts(model: Model, ridge: float):
     total = torch.stack([part.size / problem.size * part.gradient(theta)[1] for part in parts])
     assert_close(total.sum(0), whole)
     assert_close(problem.gradient(theta)[1], whole)  # the parts have weights of their own
+
+
+def test_the_error_of_several_units_is_a_relative_one(model: Model):
+    """So that the history of a fit, which advice is taken from, does not follow one output."""
+    record, scaler, errors = measure(model, 50), model.scaler, []
+    record = replace(record, y=record.y + np.random.default_rng(0).normal(size=record.y.shape))
+    for factor in (1.0, 1e6):
+        by = np.append(factor, np.ones(len(model.outputs) - 1))
+        units = replace(scaler, y_offset=scaler.y_offset * by, y_scale=scaler.y_scale * by)
+        for unit in ("mm", "Pa"):
+            outputs = (Channel("y1", unit), *model.outputs[1:])
+            own = replace(model, scaler=units, outputs=outputs)
+            problem = Problem.of(own, replace(record, y=record.y * by, outputs=outputs))
+            errors.append(problem.rmse(problem.theta))
+    of_one, of_several, of_one_scaled, of_several_scaled = errors
+    assert of_several_scaled == pytest.approx(of_several)
+    assert of_one_scaled > 1e4 * of_one
 
 
 def test_minibatches_share_records_of_unlike_lengths(model: Model):

@@ -152,6 +152,24 @@ def test_table_shows_published_results_of_these_sizes_only(result):
     assert lines[-2:] == ["everybody: A (2001)", "small: B (2002)"]
 
 
+@pytest.mark.parametrize("units", [("m", "Pa"), ("m", "")])
+def test_outputs_of_several_units_have_a_relative_error_together(units: tuple[str, str]):
+    """It decides in sweeps and comparisons: of pascals and nanometres it was the pascals'."""
+    rng = np.random.default_rng(0)
+    y, e = rng.standard_normal((2, 100, 2))
+    found = []
+    for scale in ([1.0, 1.0], [1e-9, 1e9]):
+        channels = tuple(Channel(name, unit) for name, unit in zip("ab", units, strict=True))
+        record = Record(y, y * scale, outputs=channels)
+        models = {"linear": (y + e) * scale, "NL-LFR": (y + 0.1 * e) * scale}
+        score = Response(record, "test", models).score
+        found.append((score.rmse, score.lti_rmse, score.std))
+        assert score.rmse == score.nrmse
+        assert score.rmse_by_output[1] == pytest.approx(0.1 * scale[1], rel=0.2)
+    assert found[0] == pytest.approx(found[1])
+    assert found[0][:2] == pytest.approx((0.1, 1.0), rel=0.2)
+
+
 def test_the_table_says_which_samples_are_scored():
     counts = {"samples": 300, "skip": 5, "scored": 295}
     assert of_samples(counts) == "last 295 of 300"
