@@ -86,11 +86,12 @@ def estimate_bla(
     integrators: int | Sequence[int] = 0,
     max_iter: int = 200,
 ) -> LinearModel:
-    """Best linear approximation of order ``nx``: a stable model that minimises a squared error.
+    """Best linear approximation of order ``nx``: a model that minimises a squared error.
 
     Subspace methods estimate A and C, linear least squares B and D, and Levenberg-Marquardt refines
     the best of these models in the error of choice. Unstable poles of a subspace estimate are
-    reflected into the unit circle, and the refinement rejects every step to an unstable model.
+    reflected into the unit circle, and the refinement rejects every step to an unstable model. A
+    prediction alone finds an unstable one, of a system in a loop, if that predicts clearly better.
 
     - ``"simulation"``, the default for records in steady state or without a reference: simulated
       minus measured output. For periodic records in steady state, also if that begins after the
@@ -181,7 +182,7 @@ def estimate_bla(
             f"the model explains little: {100 * fit.rmse:.0f} % of the output's rms remain. Are "
             "columns swapped, or is there drift, a long delay, noise, an even nonlinearity?",
         )
-    if not isinstance(data, FRF):
+    if not isinstance(data, FRF) and (refine != "prediction" or np.abs(model.poles).max() < 1.0):
         moment = state_moment(model.to_model(), data)
         model = replace(model, state_covariance=moment.numpy())
     return replace(model, fit=replace(fit, seconds=time.perf_counter() - clock, notes=notes))
@@ -306,6 +307,8 @@ def _stable(
         given = [SubspaceEstimate(near.A, near.C / scaler.y_scale[:, None], values, None)]
     tried = candidates(problem, nx, given)
     estimate, found = best_minimum(problem, tried, max_iter)
+    if isinstance(problem, SignalFit):
+        found = problem.unstable(found, max_iter)
     notes += _doubts(problem, estimate, found)
     weighted = isinstance(problem, ResponseFit) and problem.data.weight is not None
     if weighted and isinstance(weight, str | None) and found.rmse > 2.0:  # good fits reached 1.3
@@ -320,7 +323,8 @@ def _stable(
             f"use estimate_bla(max_iter={2 * max_iter})."
         )
     model = physical(found, scaler, about)
-    model = model.transformed(*transformation(problem, found.matrices))
+    if np.abs(model.poles).max() < 1.0:  # states without a controller have no deviation
+        model = model.transformed(*transformation(problem, found.matrices))
     rmse = found.rmse
     if found.constant is not None:
         model = replace(model, y_offset=model.y_offset + scaler.y_scale * found.constant)
@@ -430,18 +434,30 @@ def _doubts(problem: Problem, estimate: SubspaceEstimate, found: Refined) -> lis
             f"order {nx} is above what the data carry: the subspace has {carried} direction(s) "
             f"above rounding errors; try nx={max(1, carried)}."
         )
+    slowest = float(np.abs(np.linalg.eigvals(found.A)).max())
+    if slowest >= 1.0:
+        return [
+            *notes,
+            f"the system is unstable, with a pole of radius {radius(slowest)}: predictions hold, a "
+            "simulation without its controller diverges.",
+        ]
     if estimate.unstable is not None and found.rmse > 1e-6:  # a perfect fit is stable
         cost, _ = problem.with_input_matrices(estimate.unstable, estimate.C)
         stable, _ = problem.with_input_matrices(found.A, found.C)
         if cost < 0.25 * stable:
-            slowest = float(np.abs(np.linalg.eigvals(estimate.unstable)).max())
+            outside = float(np.abs(np.linalg.eigvals(estimate.unstable)).max())
             return [
                 *notes,
-                f"the data come from an unstable system: a pole of radius {radius(slowest)} "
+                f"the data come from an unstable system: a pole of radius {radius(outside)} "
                 "explains them much better than any stable model. Look for drift or feedback.",
             ]
-    slowest = float(np.abs(np.linalg.eigvals(found.A)).max())
-    if slowest > 1.0 - 1e-4:
+    if slowest > 1.0 - 1e-5 and found.K is None:
+        notes.append(
+            f"a pole lies at the limit of stability, radius {radius(slowest)}: the data drift, "
+            "integrate, or come from an unstable plant in a loop, for which refine='prediction' "
+            "(noise='innovation') is."
+        )
+    elif slowest > 1.0 - 1e-4:
         notes.append(
             f"the slowest pole has radius {radius(slowest)}: data that drift or integrate ask for "
             "one, or an order above what they carry; look at the data, or lower nx."

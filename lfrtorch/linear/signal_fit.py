@@ -38,6 +38,9 @@ OBSERVERS = (1e-4, 1e-2, 1.0)
 """Variances of the state noise that the initial innovation models of a prediction-error fit assume,
 besides none, relative to those of the states and in units of the output noise."""
 
+UNSTABLE = 20.0
+"""Fall of -2 log likelihood that an unstable system has to bring."""
+
 
 class SignalFit:
     """Least-squares problem between records and linear models of any order.
@@ -108,6 +111,19 @@ class SignalFit:
         problems = [self._problem(matrices, K) for K in gains]
         problem = min(problems, key=lambda p: p.cost(p.residual(p.theta)))
         return Search(problem, problem.theta)
+
+    def unstable(self, found: Refined, max_iter: int) -> Refined:
+        """Return an unstable system that predicts clearly better, or the found one.
+
+        In a loop the system need not be stable, but its predictor must be.
+        """
+        if found.K is None or np.abs(np.linalg.eigvals(found.A)).max() < 0.99:
+            return found
+        problem = self._problem(found.matrices, found.K, stable=False)
+        more = self.refined(Search(problem, problem.theta).advance(max_iter))
+        gain = 2 * problem.size * math.log(found.rmse / max(more.rmse, 1e-300))
+        clear = np.abs(np.linalg.eigvals(more.A)).max() >= 1.0 and gain > UNSTABLE
+        return more if clear else found
 
     def improbability(self, search: Search) -> float:
         """Return the cost plus x0ᵀ P⁻¹ x0 of each estimated start, times the error's variance.
@@ -208,7 +224,9 @@ class SignalFit:
             inputs.append(np.ones((len(each.u), 1)))
         return NormalisedRecord(np.hstack(inputs), each.y, record)
 
-    def _problem(self, matrices: Matrices, K: Array, *, observed: bool = True) -> Problem:
+    def _problem(
+        self, matrices: Matrices, K: Array, *, observed: bool = True, stable: bool = True
+    ) -> Problem:
         """Least-squares problem of the cell; unless ``observed`` in B, D and the constant alone."""
         A, B, C, D = matrices
         nu, ny = self.nu, self.ny
@@ -235,7 +253,7 @@ class SignalFit:
             if p.requires_grad
         ]
         errors = SimulationErrors(cell, self._driven, Ranks())
-        measured = slice(nu, nu + ny) if self._prediction else None
+        measured = slice(nu, nu + ny) if self._prediction and stable else None
         walls = [_PoleWall(errors, measured)] if observed else []
         return Problem(LFR(cell), errors, walls, fixed=torch.cat(fixed))
 
@@ -267,7 +285,7 @@ class SignalFit:
 class _PoleWall(Term):
     """A term without rows: infinite if a pole of a linear cell passes LARGEST_POLE.
 
-    If the cell is a predictor of ``outputs`` among its inputs, its system must be stable, too.
+    If the cell is a predictor, so must the system be, of the ``outputs`` among the inputs.
     """
 
     def __init__(self, errors: SimulationErrors, outputs: slice | None) -> None:

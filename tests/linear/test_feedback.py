@@ -272,3 +272,25 @@ def test_a_reference_that_does_not_move_is_refused():
     still = Record(**{**vars(record), "reference": np.ones(record.samples)})
     with pytest.raises(ValueError, match="reference of input 'u' is constant"):
         estimate_frf(still)
+
+
+def unstable_in_a_loop(T: int) -> Record:
+    """x+ = 1.068 x + u + w, y = x + v, u = r - y / 2."""
+    r, w, v = np.random.default_rng(0).normal(size=(3, T)) * [[1.0], [0.1], [0.1]]
+    x, u, y = 0.0, np.zeros(T), np.zeros(T)
+    for k in range(T):
+        y[k] = x + v[k]
+        u[k] = r[k] - 0.5 * y[k]
+        x = 1.068 * x + u[k] + w[k]
+    return Record(u, y)
+
+
+def test_a_prediction_finds_an_unstable_system_in_a_loop():
+    record = unstable_in_a_loop(800)
+    model = estimate_bla(record, 1, refine="prediction", feedthrough=False)
+    assert model.poles.real == pytest.approx(1.068, abs=0.01)
+    assert model.K is not None
+    assert np.abs(np.linalg.eigvals(model.A - model.K @ model.C)).max() < 1.0  # the predictor
+    assert model.fit is not None
+    assert model.fit.rmse < 0.25
+    assert "a simulation without its controller diverges" in model.fit.notes[-1]
