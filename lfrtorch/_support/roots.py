@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -35,7 +36,17 @@ def frequency_and_damping(values: Complex, fs: float) -> list[dict[str, float | 
     return listed
 
 
+def beyond(root: Mapping[str, Any]) -> bool:
+    """Tell if the frequency is above fs / 2, which stands for it."""
+    z = complex(root["real"], root["imag"])
+    return z != 0 and abs(cmath.log(z)) > math.pi
+
+
 def remark(root: Mapping[str, Any], *, pole: bool) -> str:
-    """Say that a root stands for two, and that a pole is unstable."""
-    unstable = pole and root["radius"] > 1.0
-    return ", ".join(["pair"] * bool(root["imag"]) + ["unstable"] * unstable)
+    """Say that a root stands for two or is above fs / 2, and that a pole is unstable."""
+    said = {
+        "pair": bool(root["imag"]),
+        "above fs / 2": beyond(root),
+        "unstable": pole and root["radius"] > 1.0,
+    }
+    return ", ".join(text for text, holds in said.items() if holds)

@@ -7,7 +7,7 @@ from itertools import zip_longest
 
 import numpy as np
 
-from lfrtorch._support.roots import frequency_and_damping
+from lfrtorch._support.roots import beyond, frequency_and_damping
 from lfrtorch._support.tables import Cell, factor_of, number, radius, table
 from lfrtorch._support.types import Array
 from lfrtorch.engine.operating_point import StateSpace
@@ -57,11 +57,12 @@ def system_lines(
     outputs: Sequence[Channel],
 ) -> list[str]:
     """Tables of poles and gains at rest of systems by name, physical units, next to each other."""
-    head, columns, count = [], [], 0
+    head, columns, count, fast = [], [], 0, False
     for name, system in systems.items():
         roots = frequency_and_damping(np.linalg.eigvals(system.A).astype(complex), fs)
         count = max(count, len(roots))
         kept = sorted(roots, key=lambda root: -(root["radius"] or 0.0))[:_MOST_POLES]
+        fast |= any(map(beyond, kept))
         head += [f"{name}: pole (Hz)" if name else "pole (Hz)", "damping", "radius"]
         columns.append(
             [
@@ -75,6 +76,8 @@ def system_lines(
     lines = ["", *table(head, rows).splitlines()]
     if count > _MOST_POLES:
         lines.append(f"The {_MOST_POLES} poles of the largest radius; a pair counts once.")
+    if fast:
+        lines.append(f"Poles faster than fs / 2 are given as {number(fs / 2, 4)} Hz.")
     pairs = [(i, j) for i in range(len(outputs)) for j in range(len(inputs))]
     units = [_unit(outputs[i].unit, inputs[j].unit) for i, j in pairs[:_MOST_GAINS]]
     gains = [_gain(system) for system in systems.values()]
