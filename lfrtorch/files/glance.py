@@ -153,7 +153,9 @@ def _roles(
     elif not u or not y:
         side = "outputs" if u else "inputs"
         names = ", ".join(table.columns[i].name for i in others)
-        remarks.append(f"{side}: {names}, all other columns")
+        remarks.append(
+            f"{side}: {names}, all other columns" if others else f"no column is left for {side}"
+        )
         u, y = u or others, y or others
     if not y:
         lacking = "no column is left for the outputs" if u else "there is no column to show"

@@ -135,6 +135,9 @@ def test_columns_that_are_called_as_signals_are(file: Path, signals, run):
     assert "inputs=u, outputs=y, by the names of the columns" in out
     assert "what lies between them is not looked at" not in out
     assert "outputs: u, all other columns" in run(named, "inputs=y")
+    out = run(written(file, {"y": signals["level"]}), "outputs=y", "fs=50")
+    assert "no column is left for inputs" in out
+    assert "all other columns" not in out
 
 
 @pytest.mark.usefixtures("undrawn")
