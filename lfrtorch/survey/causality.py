@@ -26,7 +26,11 @@ _FLOOR = 1e-2  # added to the input's power, relative: without power the respons
 
 # Samples of the output's past, lags after the response's peak, and samples that tell a dead time.
 _PAST, _LATER, _MOST = 10, 30, 20_000
-_CHANCE = 1e-3  # with which lags that do nothing explain so much of the output
+
+# Lags that do nothing explain so much of the output with this CHANCE; those in the next quarter of
+# a dead time explain CLEAR times as much, while a slow response rises little by little. Past inputs
+# that leave less than NEW of the present one's power, as of a band, can stand for it.
+_CHANCE, _CLEAR, _NEW = 1e-3, 4.0, 1e-3
 
 
 class TwoSidedResponse(NamedTuple):
@@ -54,6 +58,8 @@ def two_sided_response(u: Array, y: Array) -> TwoSidedResponse | None:
 def dead_time(u: Array, y: Array, peak: int) -> int:
     """Return the samples that an output (T,) waits for an input (T,), beside the usual first one.
 
+    It is 0 where that is not clear.
+
     Args:
         peak: lag of the largest value of the response.
     """
@@ -63,12 +69,16 @@ def dead_time(u: Array, y: Array, peak: int) -> int:
     past = [y[n - i : len(y) - i] for i in range(1, _PAST + 1)]
     inputs = [u[n - i : len(u) - i] for i in range(lags, -1, -1)]
     columns = np.column_stack([np.ones(len(y) - n), *past, *inputs])
-    explained = np.linalg.qr(columns)[0].T @ y[n:]
+    Q, R = np.linalg.qr(columns)
+    explained = Q.T @ y[n:]
     left = float(y[n:] @ y[n:] - explained @ explained)
     noise = max(left, np.finfo(float).eps * float(y[n:] @ y[n:])) / max(np.ptp(columns.shape), 1)
     by_first = np.cumsum(explained[: -lags - 2 : -1] ** 2) / noise  # lags 0, 0 to 1, 0 to 2, ...
-    needed = by_first > scipy.special.chdtri(np.arange(1, lags + 2), _CHANCE)
-    return max(0, int(np.argmax(needed)) - 1)
+    evidence = by_first / scipy.special.chdtri(np.arange(1, lags + 2), _CHANCE)
+    first = int(np.argmax(evidence > 1))
+    later = min(lags, first + max(1, first // 4))
+    clear = evidence[later] > _CLEAR and R[-1, -1] ** 2 > _NEW * (len(u) - n) * np.var(u)
+    return max(0, first - 1) if clear else 0
 
 
 def _by_segments(u: Array, y: Array, length: int) -> TwoSidedResponse:

@@ -322,6 +322,25 @@ def test_a_slow_system_has_no_delay(u):
         assert found(u, lag(lag(lag(u, 0.95, 0), 0.95, 0), 0.95, noise)) == {}
 
 
+@pytest.mark.parametrize("kind", ["lines", "levels", "ramps"])
+def test_a_slow_resonance_under_a_smooth_input_has_no_dead_time(kind: str):
+    """It rises unseen in the noise, or the input's past tells its present."""
+    rng, k = np.random.default_rng(0), np.arange(3000)
+    lines = np.zeros(1501, complex)
+    lines[1:375] = np.exp(2j * np.pi * rng.random(374))
+    u = {
+        "lines": 30 * np.fft.irfft(lines, 3000),
+        "levels": np.repeat(rng.uniform(-1, 1, 60), 50),
+        "ramps": np.interp(k, k[::200], rng.uniform(-1, 1, 15)),
+    }[kind]
+    pole = 0.03 * (-0.1 + 1j * np.sqrt(0.99))
+    a = np.poly(np.exp([pole, np.conj(pole)])).real
+    for noise in (0.0, 0.05):
+        y = lfilter([0, 1, 1], a, u)
+        y += noise * y.std() * np.random.default_rng(1).standard_normal(3000)
+        assert "delay" not in found(u, y)
+
+
 def test_drift(u):
     y, line = lag(u), np.linspace(0, 1, T)
     assert "drifts by 1" in found(u, y + line)["drift"]
