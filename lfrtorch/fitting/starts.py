@@ -35,6 +35,9 @@ from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coor
 _OUTPUT_RANGE = 0.3
 """Bw, Dyw ~ U(-0.3, 0.3) of the ``"zero_output"`` start."""
 
+_RUNAWAY = 1e38
+"""Normalised states whose eighth power, in polynomials, is still a number."""
+
 _OUTPUT_WEIGHTS: dict[type[Module], tuple[str, ...]] = {Network: ("Ww", "bw"), Polynomial: ("C",)}
 """The weights of a static map that make its output vanish."""
 
@@ -62,7 +65,7 @@ def initialise(
 
     ``"zero_output"`` first speeds up modes of the linear model that add next to nothing to the
     output and are slower than all others (:func:`lfrtorch.linear.modes.without_slow_minor_modes`),
-    unless it has a noise model.
+    unless it has a noise model, or the records have a measured start.
 
     Signals and states are scaled to unit standard deviation over the records, and so is every z:
     C*, D* ~ U(-1, 1), then Cz, Dzu = C*, D* over the standard deviation of C* x + D* u. The static
@@ -118,8 +121,8 @@ def initialise(
     Raises:
         ValueError: sizes below 1, or so large that a fit takes more memory than there is, a dtype
             that is no float32 or float64, an unknown method, a static map of other sizes, modes and
-            no errors above the band of the inputs, nothing that z may see, or a linear model with
-            feedthrough for a model without.
+            no errors above the band of the inputs, nothing that z may see, a linear model with
+            feedthrough for a model without, or an unstable one that runs away.
 
     References:
         Schoukens and Tóth, IFAC-PapersOnLine 53(2), 2020, section 4.2.
@@ -150,7 +153,9 @@ def initialise(
     if not feedthrough:
         _check_no_feedthrough(bla, structure, z_feedthrough)
     data = [without_coordinates(record) for record in as_records(records)]
-    if method != "paper" and bla.K is None:  # noise has slow modes
+    # Noise has slow modes, and outputs that tell the states tell those of all modes.
+    told = bla.K is not None or any(record.start == "measured" for record in data)
+    if method != "paper" and not told:
         bla = without_slow_minor_modes(bla, data)
     scaler = Scaler(
         bla.u_offset,
@@ -189,6 +194,11 @@ def initialise(
         x = torch.cat([trajectory.x[0, :-1] for trajectory in found])
         u = torch.cat([torch.as_tensor(scaler.normalise_u(r.u)).to(x) for r in data])
         std = _deviation(x)
+        if not (x.abs() < _RUNAWAY).all():
+            raise InputError(
+                "the linear model is unstable, and runs away in a simulation of a record; give a "
+                "horizon with start='measured', or shorter records."
+            )
         cell.A.copy_(cell.A * std / std[:, None])
         cell.Bu.div_(std[:, None])
         cell.Cy.mul_(std)

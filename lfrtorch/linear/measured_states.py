@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lfrtorch.linear.model import LinearFit, LinearModel
-from lfrtorch.records import Record
+from lfrtorch.records import Record, Scaler
 
 _RIDGE = 1e-9
 """Of the squares of regressors of unit rms: it holds the weight of one that does not vary at 0."""
@@ -19,10 +19,8 @@ def measured_states_model(records: Sequence[Record]) -> LinearModel:
 
     It exists for unstable and integrating systems, too, as every sample begins at a measurement.
     """
-    clock, first = time.perf_counter(), records[0]
-    u_offset, y_offset = (
-        np.concatenate([getattr(r, name) for r in records]).mean(axis=0) for name in "uy"
-    )
+    clock, first, scaler = time.perf_counter(), records[0], Scaler.of(records)
+    u_offset, y_offset = scaler.u_offset, scaler.y_offset
     u, y, after = (
         np.concatenate(parts)
         for parts in (

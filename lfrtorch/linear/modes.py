@@ -66,7 +66,8 @@ def without_slow_minor_modes(
     """The model with no minor mode slower than the slowest one that matters.
 
     The poles of slower minor modes are moved to the radius of that one, at the same angle. Their
-    inputs are scaled so that they add the same to the output under white noise.
+    inputs are scaled so that they add the same to the output under white noise. Those on the unit
+    circle and beyond stay: they integrate, or are unstable, and white noise adds without end.
 
     Args:
         model: linear model.
@@ -82,7 +83,7 @@ def without_slow_minor_modes(
     if not matters.any() or np.linalg.cond(right) > 1e8:  # no mode, or none apart
         return model
     radius = np.abs(old[matters]).max()
-    slow = ~matters & (np.abs(old) > radius)
+    slow = ~matters & (np.abs(old) > radius) & (np.abs(old) < 1.0)
     if not slow.any() or radius == 0:
         return model
     new = np.where(slow, radius * np.exp(1j * np.angle(old)), old)

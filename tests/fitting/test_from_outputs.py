@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.signal import lfilter
 
 import lfrtorch
 from lfrtorch import (
@@ -19,9 +20,11 @@ from lfrtorch import (
     Parameter,
     Record,
     Settings,
+    initialise,
     load_records,
 )
 from lfrtorch.engine.initial_state import measured_start
+from lfrtorch.fitting.from_outputs import with_measured_states
 from lfrtorch.fitting.windows import windows
 from lfrtorch.linear.measured_states import measured_states_model
 
@@ -213,3 +216,37 @@ def test_other_starts_beside_measured_ones_are_refused(flights: Dataset) -> None
     mixed = Dataset("mixed", [one, replace(one, start="zero", name="rest")], [], [])
     with pytest.raises(InputError, match="some records have start 'measured' and others not"):
         lfrtorch.identify(mixed, Settings(known=known(), horizon=HORIZON))
+
+
+K = np.arange(300.0)
+
+
+@pytest.mark.parametrize(
+    ("beside", "pole"),
+    [
+        (1.5 + 0 * K, 1.0),
+        (1.5e-9 + 0 * K, 1.0),
+        (0.01 * K, 1.0),
+        (np.exp(0.01 * K), np.exp(0.01)),
+        (0.99**K, 0.99),
+    ],
+)
+def test_an_output_that_the_input_does_not_move_keeps_its_pole(beside, pole: float) -> None:
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(300)
+    moved = lfilter([0.0, 1.0], [1.0, -0.8], u) + 1e-3 * rng.standard_normal(300)
+    record = Record(u, np.column_stack([moved, beside]), start="measured")
+    model = initialise(measured_states_model([record]), record, nz=1, nw=1, nn=2)
+    A = with_measured_states(model).lfr.cell.A.detach().numpy()
+    np.testing.assert_allclose(np.linalg.eigvals(A).max(), pole, rtol=1e-3)
+
+
+def test_a_linear_model_that_runs_away_asks_for_a_horizon() -> None:
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal(1500), np.zeros(1500)
+    for k in range(1499):
+        u[k] -= 1.5 * y[k]
+        y[k + 1] = 1.8 * y[k] + u[k]
+    record = Record(u, y, start="measured")
+    with pytest.raises(ValueError, match=r"unstable.* give a horizon"):
+        initialise(measured_states_model([record]), record, nz=1, nw=1, nn=2)

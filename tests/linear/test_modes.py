@@ -81,6 +81,14 @@ def test_other_models_stay(slow, gain, minor):
     assert without_slow_minor_modes(model, measured(model), minor) is model
 
 
+@pytest.mark.parametrize("slow", [1.0, 1.0005])
+def test_modes_that_do_not_fade_stay(slow: float):
+    model, _ = assembled(slow, gain=1e-7)
+    record = measured(model, "zero")
+    assert (shares(model, record)[1] < 0.1).any()
+    assert without_slow_minor_modes(model, record) is model
+
+
 def test_a_model_without_error_stays():
     model, _ = assembled()
     record = measured(model)
