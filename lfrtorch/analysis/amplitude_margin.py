@@ -14,13 +14,13 @@ LOUDER = (1.25, 1.5, 2.0)
 
 
 def largest_stable_amplitude(model: Model, records: Sequence[Record]) -> float:
-    """Return the largest of ``LOUDER`` up to which no output diverges; 1 if there is none.
+    """Return the largest of 1 and ``LOUDER`` up to which no output diverges; 0 if there is none.
 
     Beyond the amplitudes that it was fitted at, a model's static nonlinearity may feed back more.
     """
     offset, scale = model.scaler.u_offset, model.scaler.y_scale
-    found = 1.0
-    for factor in LOUDER:
+    found = 0.0
+    for factor in (1.0, *LOUDER):
         for record in records:
             y = model.simulate(offset + factor * (record.u - offset))
             far = np.abs((y - model.scaler.y_offset) / scale)

@@ -454,8 +454,8 @@ def _doubts(problem: Problem, estimate: SubspaceEstimate, found: Refined) -> lis
     if slowest > 1.0 - 1e-5 and found.K is None:
         notes.append(
             f"a pole lies at the limit of stability, radius {radius(slowest)}: the data drift, "
-            "integrate, or come from an unstable plant in a loop, for which refine='prediction' "
-            "(noise='innovation') is."
+            "integrate, or come from an unstable plant in a loop;\nfor such a plant give "
+            "refine='prediction' (noise='innovation')."
         )
     elif slowest > 1.0 - 1e-4:
         notes.append(

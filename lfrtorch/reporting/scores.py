@@ -333,6 +333,8 @@ def stability(stable_to: float) -> str:
             f"Stable on the training inputs {stable_to:g} times as loud, the most that was tried "
             f"({tried}). That says nothing of the accuracy there."
         )
+    if stable_to < 1.0:
+        return "The simulation runs away on the training inputs: the model is one for predictions."
     stable = f"{stable_to:g} times as loud" if stable_to > 1 else "as they are"
     return (
         f"Stable on the training inputs {stable}, and no longer on the next louder ones tried "

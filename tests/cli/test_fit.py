@@ -184,8 +184,9 @@ def test_run_writes_its_folder_and_the_checkpoint_simulates(csv, tmp_path, monke
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 10
     # five of the test, BLA, poles, map, steps, history
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if "starts=8" in line]
+    line, command = [text for text in capsys.readouterr().out.splitlines() if "starts=8" in text]
     assert line.startswith("next: ")
+    assert command.strip().startswith("python train.py data=file ")
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["command"].startswith("python train.py data=file ")
     score = metrics["scores"]["test"]

@@ -79,7 +79,7 @@ def test_command_writes_page_and_tables(study: Path, monkeypatch, capsys):
     assert len(rows) == len(ERRORS) + 1
     assert {row["nn"] for row in rows if row["dataset"] == "tanks"} == {"5", "10", "15"}
     assert "| nn=5,seed=0 " in (study / "out" / "comparison.md").read_text()
-    assert (study / "out" / "comparison.html").read_text().count("data:image/png") == 3
+    assert (study / "out" / "comparison.html").read_text().count("data:image/png") == 2
 
 
 def test_data_words_choose_the_record_that_is_simulated(study: Path, monkeypatch):
