@@ -39,7 +39,7 @@ from lfrtorch._support import tables
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError, LfrtorchError, brief
-from lfrtorch._support.tables import percent, quantity
+from lfrtorch._support.tables import percent, quantity, radius
 from lfrtorch._support.threads import each_alone, worth_threads
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
@@ -301,6 +301,13 @@ def choose_sizes(
             "no NL-LFR of the sizes that were tried can be begun on these records; give longer "
             "records, or set the sizes."
         )
+    if leader() is None:
+        watch(
+            "note: all sizes run away where they are left out, and the smallest is fitted. A "
+            f"linear model's slowest pole has radius {radius(study.slowest)}:\na system that "
+            "integrates, or is unstable in a loop, does so (integrators=1, or noise=innovation), "
+            "or one that is louder there"
+        )
     if refused := sum(c.remembers for c in tried):
         watch(
             f"note: {refused} of {len(tried)} candidates are left out: what they simulate depends "
@@ -440,6 +447,12 @@ class _Study:
             )
         good = as_good([each.squares.ravel() for each in found], self.counts.ravel())
         return found[int(np.argmax(good))]
+
+    @property
+    def slowest(self) -> float:
+        """Largest radius of a pole of the linear models without a stretch."""
+        models = [model for each in self._linear.values() if each for model in each.models]
+        return max(float(np.abs(model.poles).max()) for model in models)
 
     def candidates(self, sizes: Sizes, start: Start, seed: int, base: float) -> list[Candidate]:
         """Return a candidate for each ridge, as long as they get better; none if no fit begins."""

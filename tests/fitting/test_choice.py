@@ -193,7 +193,9 @@ def test_sizes_that_do_not_forget_where_they_began_are_refused(monkeypatch):
 @pytest.mark.usefixtures("short_paths")
 def test_where_all_sizes_run_away_the_smallest_is_chosen_and_has_no_error(monkeypatch):
     monkeypatch.setattr(procedure, "forgets", lambda *_: lfrtorch.Memory(np.inf))
-    found = chosen(measured(2.0))
+    said = list[str]()
+    found = chosen(measured(2.0), watch=said.append)
+    assert any("note: all sizes run away" in text and "has radius 0." in text for text in said)
     assert found.chosen.parameters_net == min(c.parameters_net for c in found.candidates)
     assert not np.isfinite(nested(found))
 
