@@ -106,8 +106,8 @@ class Record:
     Raises:
         ValueError: NaN, infinite or masked samples, levels or an ``fs`` beyond 1e-100 to 1e100,
             different lengths, wrong shapes, negative weights, a ``skip`` or a ``valid`` that leaves
-            no sample, a period that does not fit, or a reference of other samples or channels than
-            the input.
+            no sample, a measured start from an output that is not valid, a period that does not
+            fit, or a reference of other samples or channels than the input.
 
     Example:
         >>> record = lfrtorch.Record(np.sin(np.arange(100.0)), np.zeros(100), fs=50.0, skip=10)
@@ -246,6 +246,11 @@ class Record:
             raise InputError(
                 f"record '{self.name}' has outputs that are not valid, and start is "
                 f"{self.start!r}: a steady state needs whole periods. Give start='estimated'."
+            )
+        if self.start == "measured" and not self.valid[0].all():
+            raise InputError(
+                f"record '{self.name}' has start 'measured', and its first output is not valid; "
+                "cut the record to where all outputs are, or give start='estimated'."
             )
         if not self.scored.any():
             raise InputError(

@@ -492,3 +492,9 @@ def test_other_signals_of_a_record_are_named_each():
         others = {field: value for field, value in (signals | kept).items() if field != name}
         with pytest.raises(TypeError, match=f"'{name}'"):
             record.with_signals(**others)
+
+
+def test_a_measured_start_needs_the_first_output():
+    with pytest.raises(ValueError, match="its first output is not valid; cut the record"):
+        dataclasses.replace(with_gap()[3:], start="measured")
+    assert dataclasses.replace(with_gap(), start="measured").samples == 10
