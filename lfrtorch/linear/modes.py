@@ -18,7 +18,7 @@ from jaxtyping import Complex128, Float
 
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.model import LinearModel, balancing
-from lfrtorch.records import Channel, Record, as_records, without_coordinates
+from lfrtorch.records import Channel, Record, as_records, rms_scale, without_coordinates
 
 MINOR = 1 / 3
 """Largest share in the output that counts as minor. Of the linear models of Bouc-Wen,
@@ -91,7 +91,10 @@ def without_slow_minor_modes(
     A, B = ((right * new) @ left).real, ((right * gain) @ left @ model.B).real
     unknown = dict.fromkeys(("K", "innovation_covariance", "covariance", "state_covariance"))
     quick = replace(model, A=A, B=B, **unknown)
-    return quick.transformed(*balancing(A, B, model.C))
+    records = as_records(data)  # balanced in physical units, the states would depend on those
+    u_scale = rms_scale([record.u for record in records], model.u_offset)
+    y_scale = rms_scale([record.y for record in records], model.y_offset)
+    return quick.transformed(*balancing(A, B * u_scale, model.C / y_scale[:, None]))
 
 
 def _modes(model: LinearModel) -> tuple[Complex, Complex, Complex]:

@@ -114,3 +114,26 @@ def test_the_papers_start_and_a_noise_model_keep_all_modes(method, noise, slowes
     start = initialise(model, measured(model), nz=1, nw=1, nn=3, method=method)
     poles = np.linalg.eigvals(start.lfr.cell.A.detach().numpy())
     np.testing.assert_allclose(np.abs(poles).max(), slowest, rtol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e3, 1e9])
+def test_states_do_not_depend_on_the_units_of_the_signals(unit: float):
+    model, _ = assembled()
+    whole = replace(
+        model,
+        C=np.vstack([model.C, model.C @ model.A]),
+        D=np.zeros((2, 1)),
+        y_offset=np.zeros(2),
+        outputs=(Channel("y1"), Channel("y2")),
+    )
+    generator = np.random.default_rng(0)
+    u = generator.normal(size=(4096, 1))
+    y = whole.simulate(Record(u, np.zeros((4096, 2)), 1.0)) + generator.normal(size=(4096, 2))
+
+    def quick(scale: np.ndarray) -> np.ndarray:
+        scaled = replace(whole, C=scale[:, None] * whole.C)
+        return without_slow_minor_modes(scaled, Record(u, y * scale)).A
+
+    expected = quick(np.ones(2))
+    assert not np.allclose(expected, whole.A)
+    np.testing.assert_allclose(quick(np.array([1.0, unit])), expected, atol=1e-6)
