@@ -247,8 +247,11 @@ class LinearModel:
             >>> y_hat.shape, lfrtorch.nrmse(record, y_hat) < 0.3
             ((400, 1), True)
         """
-        data = _without_units(without_coordinates(data)) if isinstance(data, Record) else data
-        return self.to_model().simulate(data)
+        if not isinstance(data, Record):
+            return self.to_model().simulate(data)
+        deviation = np.std(data.y, axis=0) if len(self.outputs) > 1 else np.zeros(1)
+        y_scale = np.where(deviation > 0, deviation, 1.0)
+        return self._in_units(y_scale).simulate(without_coordinates(data))
 
     def predict(self, record: Record) -> Array:
         """Output (T, ny) predicted one sample ahead from the outputs before, physical units.
@@ -352,11 +355,15 @@ class LinearModel:
             >>> bla.to_model().sizes["nx"]
             1
         """
+        return self._in_units(np.ones(len(self.outputs)))
+
+    def _in_units(self, y_scale: Array) -> Model:
+        """The same, whose normalised outputs have these units."""
         nu, ny = len(self.inputs), len(self.outputs)
-        unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
+        unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, y_scale)
         cell = LFRCell(nu, ny, self.nx, dtype=torch.float64, random=False)
         self.write(cell, unit)
-        K = None if self.K is None else torch.as_tensor(self.K)
+        K = None if self.K is None else torch.as_tensor(self.K * y_scale)
         return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs, K=K)
 
     def to_scipy(self) -> scipy.signal.StateSpace:
@@ -466,14 +473,6 @@ def control_labels(channels: Sequence[Channel]) -> list[str]:
             label += "_"
         labels.append(label)
     return labels
-
-
-def _without_units(record: Record) -> Record:
-    """Return the record with weights by which its outputs count alike in physical units."""
-    if record.y.shape[1] == 1:
-        return record
-    power = np.var(record.y, axis=0)
-    return replace(record, weight=record.weight / np.where(power > 0, power, 1.0))
 
 
 _ALWAYS = ("A", "B", "C", "D", "u_offset", "y_offset")

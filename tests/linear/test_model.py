@@ -529,3 +529,18 @@ def test_weights_of_another_model(model: LinearModel, tmp_path: Path):
     (folder / "weights.safetensors").write_bytes((other / "weights.safetensors").read_bytes())
     with pytest.raises(ValueError, match="is damaged: its description and weights do not fit"):
         LinearModel.load(folder)
+
+
+@pytest.mark.parametrize("units", [(1e11, 1e-11), (1e-11, 1e11)])
+def test_an_estimated_start_does_not_depend_on_the_units_of_outputs(units):
+    rng, zero = np.random.default_rng(0), np.zeros(2)
+    u, T = rng.standard_normal((100, 1)), 100
+    A, B, outputs = np.diag([0.95, 0.9]), np.array([[0.3], [0.4]]), (Channel("p"), Channel("x"))
+
+    def simulated(scale: np.ndarray) -> np.ndarray:
+        rest = (np.zeros((2, 1)), 1.0, np.zeros(1), zero, (Channel("u"),), outputs)
+        model = LinearModel(A, B, np.diag(scale), *rest)
+        free = np.stack([4.0 * 0.95 ** np.arange(T), 4.0 * 0.9 ** np.arange(T)], axis=1)
+        return model.simulate(Record(u, free * scale, start="estimated")) / scale
+
+    np.testing.assert_allclose(simulated(np.array(units)), simulated(np.ones(2)), atol=1e-6)
