@@ -28,8 +28,8 @@ _MOST = 2**21  # samples of a record that are looked at, the first ones after ``
 # and an output's rms within each part is at most QUIET of that in the record.
 _STILL, _STRETCHES, _REST, _SETTLED, _QUIET = 0.2, 200, 0.05, 0.1, 0.2
 
-# A record is oversampled if all power lies below fs / OVERSAMPLED; decimation leaves it below
-# fs / WANTED.
+# A record is oversampled if 99 % of the power lies below fs / OVERSAMPLED; decimation leaves it
+# below fs / WANTED.
 _OVERSAMPLED, _WANTED = 30, 10
 _COARSE, _FEW = 0.05, 200  # step of a coarse output over its rms; least samples of its record
 
@@ -297,8 +297,10 @@ def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
         factor = int(fs / (_WANTED * highest)) if highest > 0 else 1
         yield Note(
             "oversampled",
-            f"all power lies below {highest:.3g} {unit}, fs / {fs / highest:.0f}: the record is "
-            f"oversampled; decimate by {factor} (scipy.signal.decimate) for a faster fit.",
+            f"99 % of the power of each signal lies below {highest:.3g} {unit}, fs / "
+            f"{fs / highest:.0f}: the record is oversampled; decimate by {factor} "
+            "(scipy.signal.decimate) for a faster fit, unless modes above "
+            f"{fs / (2 * factor):.3g} {unit}, which that takes away, matter.",
         )
     period = found.inputs[0].period if found.inputs else None
     if period is not None and period < T < 2 * period:
