@@ -297,10 +297,9 @@ def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
         factor = int(fs / (_WANTED * highest)) if highest > 0 else 1
         yield Note(
             "oversampled",
-            f"99 % of the power of each signal lies below {highest:.3g} {unit}, fs / "
-            f"{fs / highest:.0f}: the record is oversampled; decimate by {factor} "
-            "(scipy.signal.decimate) for a faster fit, unless modes above "
-            f"{fs / (2 * factor):.3g} {unit}, which that takes away, matter.",
+            f"99 % of all power lies below {highest:.3g} {unit}, fs / {fs / highest:.0f}: the "
+            f"record is oversampled; decimate by {factor} (scipy.signal.decimate) for a faster "
+            f"fit, unless modes above {fs / (2 * factor):.3g} {unit}, which go with it, matter.",
         )
     period = found.inputs[0].period if found.inputs else None
     if period is not None and period < T < 2 * period:
@@ -416,9 +415,8 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
                 yield Note(
                     f"delay {name} {j}",
                     f"a dead time of about {delay} samples{lasting} from input "
-                    f"'{found.inputs[j].channel.name}' to output '{name}', beside that of one "
-                    "sample which any system without feedthrough has:\nshift the output by it, or "
-                    "a model spends as many states on it.",
+                    f"'{found.inputs[j].channel.name}' to output '{name}', after the usual one "
+                    "sample: shift the output by it, or a model spends as many states on it.",
                 )
         if not integrates:
             yield from _drift(output, y[:, i], u)

@@ -374,7 +374,7 @@ def narrow(*lines: int) -> Record:
         (lab(FULL.u[0]), {"lines": 3}, "lines is 3; give a list of whole numbers"),
         (lab(ODD.u[0]), {"lines": [3, 4]}, "input 'force' has no power at line 4; give lines"),
         (lab(REST, RNG.normal(size=60)), {}, "input 'force' is constant in each record: a spec"),
-        (lab(REST, RNG.normal(size=60), start="zero"), {}, "input 'force' is constant in each r"),
+        (lab(REST, RNG.normal(size=60), start="zero"), {}, "input 'force' is constant in each rec"),
         (lab(np.ones((2, 1))), {}, "2 samples have no line between 0 and fs / 2; give more"),
         ([lab(GAP), lab(GAP[::-1])], {}, "in every input (lines excited: 2 in 'force', 2 in 'valv"),
         (lab(FULL.u[0], start="zero"), {"method": "robust"}, "record 'lab' has no period; give"),
