@@ -541,6 +541,7 @@ def test_an_estimated_start_does_not_depend_on_the_units_of_outputs(units):
         rest = (np.zeros((2, 1)), 1.0, np.zeros(1), zero, (Channel("u"),), outputs)
         model = LinearModel(A, B, np.diag(scale), *rest)
         free = np.stack([4.0 * 0.95 ** np.arange(T), 4.0 * 0.9 ** np.arange(T)], axis=1)
-        return model.simulate(Record(u, free * scale, start="estimated")) / scale
+        y = np.asarray(free * scale, dtype=np.float64)
+        return model.simulate(Record(u, y, start="estimated")) / scale
 
     np.testing.assert_allclose(simulated(np.array(units)), simulated(np.ones(2)), atol=1e-6)
