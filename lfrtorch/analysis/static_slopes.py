@@ -36,7 +36,6 @@ def infinite_slope(model: Model, records: Sequence[Record]) -> str:
         by = "a parameter" if j >= cell.nz else f"{by}, which is {value}"
         return (
             f"the derivative of {of} is not finite in sample {k} of record '{record.name}', by "
-            f"{by};\na root, a logarithm and a division have none at 0: keep away from it, "
-            "as in torch.sqrt(level.clamp(min=1e-6)), or choose by torch.where"
+            f"{by}; keep roots, logarithms and divisions off 0 (clamp(min=1e-6), torch.where)"
         )
     return ""

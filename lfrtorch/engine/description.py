@@ -74,10 +74,12 @@ def system_lines(
     found = zip_longest(*columns, fillvalue=["", "", ""])
     rows = [[text for part in row for text in part] for row in found]
     lines = ["", *table(head, rows).splitlines()]
+    remarks = []
     if count > _MOST_POLES:
-        lines.append(f"The {_MOST_POLES} poles of the largest radius; a pair counts once.")
+        remarks.append(f"The {_MOST_POLES} poles of the largest radius; a pair counts once.")
     if fast:
-        lines.append(f"Poles faster than fs / 2 are given as {number(fs / 2, 4)} Hz.")
+        remarks.append(f"Poles faster than fs / 2 are given as {number(fs / 2, 4)} Hz.")
+    lines += [" ".join(remarks)] if remarks else []
     pairs = [(i, j) for i in range(len(outputs)) for j in range(len(inputs))]
     units = [_unit(outputs[i].unit, inputs[j].unit) for i, j in pairs[:_MOST_GAINS]]
     gains = [_gain(system) for system in systems.values()]

@@ -298,7 +298,7 @@ def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
         yield Note(
             "oversampled",
             f"99 % of all power lies below {highest:.3g} {unit}, fs / {fs / highest:.0f}: the "
-            f"record is oversampled; decimate by {factor} (scipy.signal.decimate) for a faster "
+            f"record is oversampled.\nDecimate by {factor} (scipy.signal.decimate) for a faster "
             f"fit, unless modes above {fs / (2 * factor):.3g} {unit}, which go with it, matter.",
         )
     period = found.inputs[0].period if found.inputs else None
@@ -416,7 +416,7 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
                     f"delay {name} {j}",
                     f"a dead time of about {delay} samples{lasting} from input "
                     f"'{found.inputs[j].channel.name}' to output '{name}', after the usual one "
-                    "sample: shift the output by it, or a model spends as many states on it.",
+                    "sample:\nshift the output by it, or a model spends as many states on it.",
                 )
         if not integrates:
             yield from _drift(output, y[:, i], u)

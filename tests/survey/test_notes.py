@@ -274,7 +274,7 @@ def test_oversampled(u):
     said = found(slow, lag(slow, 0.99, noise=0), 1000.0)
     assert set(said) == {"oversampled"}
     assert "Hz, fs / " in said["oversampled"]
-    factor = int(said["oversampled"].split("decimate by ")[1].split()[0])
+    factor = int(said["oversampled"].split("Decimate by ")[1].split()[0])
     assert f"unless modes above {500 / factor:.3g} Hz" in said["oversampled"]
     faster = sosfilt(butter(4, 0.1, output="sos"), u)
     assert found(faster, lag(faster, noise=0)) == {}
