@@ -103,8 +103,9 @@ def identify(
             how far it is. :class:`lfrtorch.reporting.Console` prints every step,
             :class:`Observer` nothing.
         snapshots: where the starts are kept, for a program that goes on with them.
-        ranks, stop: processes that share the training records, and what ends the fit early, see
-            :func:`lfrtorch.fit`.
+        ranks: processes that share the starts or the training records, see :func:`lfrtorch.fit`.
+        stop: asked before each iteration; the fit ends there if it returns True, and the best
+            iterate so far is kept.
 
     Returns:
         The models, their scores and all that was chosen on the way. If the fit was interrupted, or
