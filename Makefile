@@ -59,6 +59,7 @@ reproduce: $(READY)  ## the public benchmarks at hand -> RESULTS.md (ARGS="silve
 
 docs: $(READY)  ## guide, notebooks, reference -> site/; a broken link is an error (ARGS="-D nb_execution_mode=off")
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	@rm -rf docs/api/generated
 	@$(BIN)/sphinx-build -qW --keep-going $(ARGS) -d site/doctrees docs site/html
 	@echo "Open site/html/index.html"
 
@@ -74,7 +75,7 @@ dist: $(READY)  ## wheel and sdist in dist/, the same bytes whenever they are bu
 	@sha256sum dist/*
 
 clean:  ## remove caches and builds; .venv and runs stay
-	@rm -rf build dist site *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	@rm -rf build dist site docs/api/generated *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	@find . \( -path ./$(VENV) -o -path ./runs \) -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +
 
 # The mark .partial says that a set-up did not come to its end: the next one then starts afresh.

@@ -7,6 +7,8 @@ from typing import Any
 from sphinx.application import Sphinx
 from sphinx.util.inspect import TypeAliasForwardRef
 
+import lfrtorch
+
 project = "lfrtorch"
 author = "lfrtorch contributors"
 release = importlib.metadata.version(project)
@@ -19,7 +21,14 @@ html_theme_options = {
 }
 html_show_copyright = False
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
+templates_path = ["_templates"]
 exclude_patterns = ["**.ipynb_checkpoints"]
 suppress_warnings = [
     "myst.header",  # a page of benchmarks/ may leave out a level of headings
@@ -36,8 +45,26 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_merge_streams = True
 
-# Reference: members in the order of the source.
-autodoc_default_options = {"members": True}
+# Reference: a page an object, members in the order of the source.
+autosummary_context = {
+    "without_members": {
+        f"lfrtorch.{name}"
+        for name in (
+            *("Preview", "LevenbergMarquardt", "Adam", "fitting.trainer.Trainer", "Snapshots"),
+            *("LfrtorchError", "InputError"),
+        )
+    }
+}
+autosummary_filename_map = {  # where case alone tells a function from its result
+    f"{module.__name__}.{name}": f"{module.__name__}.{name}-class"
+    for module in (lfrtorch, lfrtorch.analysis)
+    for name in module.__all__
+    if name != name.lower() and name.lower() in module.__all__
+}
+autodoc_default_options = {
+    "members": True,
+    "exclude-members": "set_fit_request, set_score_request",  # made by scikit-learn
+}
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autodoc_typehints_format = "short"
