@@ -30,7 +30,7 @@ def motor() -> Record:
     names: dict = {}
     code = page.split("```python\n")[1].split("```")[0].split("table, header")[0]
     exec(code, names)
-    inputs, outputs = [lfrtorch.Channel("voltage", "V")], [lfrtorch.Channel("speed", "rad/s")]
+    inputs, outputs = (lfrtorch.Channel("voltage", "V"),), (lfrtorch.Channel("speed", "rad/s"),)
     return Record(names["u"], names["speed"], fs=100, name="motor", inputs=inputs, outputs=outputs)
 
 
