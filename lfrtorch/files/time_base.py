@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -162,12 +163,13 @@ def _columns(
     table: Table, used: Sequence[int], *, named: bool
 ) -> tuple[list[_Found], list[tuple[int, UnevenError]]]:
     """Find times among the columns that are not measured, and why others are none."""
-    usual = max(table.lengths, key=table.lengths.count, default=0)
-    with_them = used or [i for i, length in enumerate(table.lengths) if length == usual][:1]
+    usual = [length for length, _ in Counter(table.lengths).most_common(1)]
+    with_them = used or [i for i, length in enumerate(table.lengths) if [length] == usual][:1]
+    measured = set(used)
     left = [
         column
         for column, channel in enumerate(table.columns)
-        if column not in used
+        if column not in measured
         and (not with_them or table.beside(column, with_them))
         and (not named or is_time(channel) or column in table.clocks)
     ]
@@ -319,9 +321,9 @@ def _header(table: Table, base: TimeBase) -> str:
 
 def _labels(table: Table, used: Sequence[int], T: int) -> dict[str, NDArray[Any]]:
     """What columns hold that are named as numbers of runs are."""
-    found = {}
+    found, measured = {}, set(used)
     for i, channel in enumerate(table.columns):
-        if i not in used and is_run(channel.name):
+        if i not in measured and is_run(channel.name):
             each = table.labels(i)[:T]
             if len(each) == T:
                 found[channel.name] = each
