@@ -72,9 +72,13 @@ def test_command_of_the_guide_has_settings_that_exist(name: str, words: str):
 
 @pytest.mark.numeric
 @pytest.mark.parametrize(
-    "page", [ROOT / "README.md", DOCS / "guide" / "tutorial.md"], ids=lambda page: page.stem
+    ("page", "more"),
+    [
+        pytest.param(DOCS / "guide" / "tutorial.md", FEW, id="tutorial, few iterations"),
+        pytest.param(DOCS / "guide" / "tutorial.md", [], id="tutorial", marks=pytest.mark.slow),
+        pytest.param(ROOT / "README.md", [], id="README", marks=pytest.mark.slow),
+    ],
 )
-@pytest.mark.parametrize("more", [FEW, pytest.param([], marks=pytest.mark.slow)], ids=["few", ""])
 def test_commands_run_in_an_empty_folder(
     page: Path, more: list[str], tmp_path, monkeypatch, capsys
 ):
