@@ -162,6 +162,17 @@ def test_a_ridge_is_chosen_beside(asked: dict[str, Any], dataset: Dataset):
     assert run.settings.structure == asked.get("structure", "free")
 
 
+@pytest.mark.usefixtures("short_paths")
+def test_a_mean_of_starts_that_predict_predicts(dataset: Dataset):
+    asked = settings(ridge="auto", noise="innovation", starts=4)
+    run = identify(dataset, asked)
+    assert 1 < run.fit.averaged < 4
+    assert run.model.K is not None
+    test = dataset.tests[0]
+    mean = np.mean([member.predict(test) for member in run.fit.members], axis=0)
+    assert np.allclose(run.model.predict(test), mean)
+
+
 def test_a_ridge_is_not_chosen_for_a_model_that_has_seen_the_data(dataset: Dataset):
     model = identify(dataset, settings()).model
     with pytest.raises(ValueError, match=r"ridge is auto, and the model of init_from has seen"):

@@ -15,6 +15,7 @@ from lfrtorch.fitting.distillation import distil
 from lfrtorch.fitting.first_fit import cost_in_full
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import AS_GOOD
+from lfrtorch.fitting.prediction import predicting
 from lfrtorch.fitting.refit import refit
 from lfrtorch.fitting.stage import Stage
 from lfrtorch.fitting.state_scaling import scale_states
@@ -68,20 +69,25 @@ def distilled(stage: Stage, result: FitResult) -> FitResult:
 
 def without_poor_starts(stage: Stage, result: FitResult) -> FitResult:
     """The fit whose mean is of the few starts with the least training errors."""
-    members = result.members[:_AVERAGED]
+    members, train = list(result.members[:_AVERAGED]), stage.dataset.train
     if not members:
         return result
-    judges = [Problem.judge(model, stage.dataset.train) for model in members]
+    predicts = result.model.K is not None  # gains of models do not make one of their mean
+    models, train = predicting(members, train) if predicts else (members, train)
+    assert isinstance(models, list)
+    judges = [Problem.judge(model, train) for model in models]
     costs = torch.tensor([j.cost(j.residual(j.theta)) for j in judges], dtype=torch.float64)
     costs = stage.ranks.first(costs.nan_to_num(torch.inf))  # the simulation of some may run away
     near = int((costs <= _POOR**2 * costs.min()).sum())
     if near == len(result.members):
         return result
-    members = tuple(members[i] for i in costs.argsort(stable=True)[:near].tolist())
-    mean = members[0] if near == 1 else mean_model(members)
-    given = any(record.start == "given" for record in stage.dataset.train)
-    scale_states(mean, stage.dataset.train, keep_coordinates=given)
-    return replace(result, model=mean, averaged=near, members=members if near > 1 else ())
+    order = costs.argsort(stable=True)[:near].tolist()
+    mean = models[order[0]] if near == 1 else mean_model([models[i] for i in order])
+    given = any(record.start == "given" for record in train)
+    scale_states(mean, train, keep_coordinates=given)
+    mean = mean.innovation_form() if predicts else mean
+    kept = tuple(members[i] for i in order) if near > 1 else ()
+    return replace(result, model=mean, averaged=near, members=kept)
 
 
 def refitted(stage: Stage, result: FitResult) -> tuple[FitResult, FitResult | None]:
