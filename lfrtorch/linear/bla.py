@@ -191,11 +191,18 @@ def estimate_bla(
 @spread_by_hand()
 def refined_near(model: LinearModel, records: Sequence[Record]) -> LinearModel:
     """Fit a model's order to other records of its kind in simulation error, from that model."""
-    # That is all a fit without some of the samples takes. Exact integrators stay as they are.
-    if model.poles.size and np.abs(model.poles).max() >= 1.0:
-        return model
+    # That is all a fit without some of the samples takes. One with exact integrators is made anew,
+    # and another one that does not fade stays as it is.
     data = [without_coordinates(record) for record in records]
     offset = bool(model.y_offset.any() or model.u_offset.any())
+    if model.poles.size and np.abs(model.poles).max() >= 1.0:
+        integrate = _integrating_outputs(model)
+        if not any(integrate):
+            return model
+        feedthrough = bool(model.D.any())
+        return estimate_bla(
+            data, model.nx, offset=offset, feedthrough=feedthrough, integrators=integrate
+        )
     scaler = Scaler.of(data, offset=offset)
     problem = SignalFit(
         [scaler.normalise(record) for record in data],
@@ -213,6 +220,16 @@ def refined_near(model: LinearModel, records: Sequence[Record]) -> LinearModel:
     fit = LinearFit("simulation", found.rmse, found.iterations, found.reason, 0.0)
     moment = state_moment(near.to_model(), data).numpy()
     return replace(near, state_covariance=moment, fit=fit)
+
+
+def _integrating_outputs(model: LinearModel) -> list[int]:
+    """Integrators behind each output, 0 or 1; zeros if a pole does not fade that is none."""
+    values, vectors = np.linalg.eig(model.A)
+    exact = np.isclose(values, 1.0, rtol=0.0, atol=1e-12)
+    if np.abs(values[~exact]).max(initial=0.0) >= 1.0:
+        return [0] * len(model.C)
+    seen = np.abs(model.C @ vectors[:, exact])
+    return [int(row.any()) for row in seen > 1e-9 * np.abs(model.C).max()]
 
 
 def default_criterion(records: Sequence[Record]) -> Criterion:

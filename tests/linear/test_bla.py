@@ -19,6 +19,7 @@ from lfrtorch.linear.bla import estimate_bla, refined_near
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.requirements import steady_state
+from lfrtorch.metrics import rms
 from lfrtorch.records import Channel, Record, Scaler, Start
 
 pytestmark = pytest.mark.numeric
@@ -109,6 +110,22 @@ def test_a_model_is_refined_without_samples_that_are_left_out():
     assert np.all(np.abs(errors).max(axis=0) < 1e-6 * np.std(record.y, axis=0))
     unstable = replace(refined, A=refined.A * 1.1 / np.abs(refined.poles).max())
     assert refined_near(unstable, [part]) is unstable
+
+
+def test_a_model_that_integrates_is_made_anew_without_samples_that_are_left_out():
+    rng = np.random.default_rng(0)
+    u, speed, y = rng.standard_normal(600), np.zeros(600), np.zeros(600)
+    for k in range(599):
+        speed[k + 1] = 0.8 * speed[k] + 0.3 * u[k]
+        y[k + 1] = y[k] + speed[k]
+    valid = np.abs(np.arange(600) - 275) > 75
+    wrong = Record(u, np.where(valid, y, y + 20.0), start="estimated")
+    seen = estimate_bla(wrong, 2, integrators=1)
+    refined = refined_near(seen, [replace(wrong, valid=valid)])
+    assert np.isclose(refined.poles, 1.0, rtol=0.0, atol=1e-12).sum() == 1
+    true = Record(u, y, start="estimated", skip=50)
+    apart, near = (rms(true.errors(model.simulate(true))) for model in (seen, refined))
+    assert near < 1e-6 < apart
 
 
 def test_small_and_large_units_change_nothing():
