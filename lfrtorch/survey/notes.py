@@ -17,7 +17,7 @@ from lfrtorch.survey.measurement import Survey, survey_measurement
 from lfrtorch.survey.mechanics import reacting, rubs
 from lfrtorch.survey.outliers import input_outliers, output_outliers
 from lfrtorch.survey.sensors import frozen, marked
-from lfrtorch.survey.signal import SignalSurvey
+from lfrtorch.survey.signal import SignalSurvey, held
 
 _SHORT = 300  # samples: a small NL-LFR model has 50 to 100 parameters
 _ENOUGH = 100  # samples of a record for notes on what it excites
@@ -301,6 +301,20 @@ def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
             f"record is oversampled.\nDecimate by {factor} (scipy.signal.decimate) for a faster "
             f"fit, unless modes above {fs / (2 * factor):.3g} {unit}, which go with it, matter.",
         )
+    elif found.outputs and (clock := held(u)) is not None:
+        hold, first = clock[0], skipped + found.whole.start + clock[1]
+        highest = max(fs if one.band is None else one.band[1] for one in found.outputs)
+        factor = max(
+            k for k in range(1, hold + 1) if not hold % k and k <= max(1, fs / (_WANTED * highest))
+        )
+        if factor > 1 and highest < min(fs / _OVERSAMPLED, fs / (2 * hold)):
+            yield Note(
+                "held",
+                f"the inputs change every {hold} samples only, and 99 % of the outputs' power lies "
+                f"below {highest:.3g} {unit}: one sample in {factor}, sample {first} "
+                "among them, is enough for a faster fit, unless modes above "
+                f"{fs / (2 * factor):.3g} {unit} matter.",
+            )
     period = found.inputs[0].period if found.inputs else None
     if period is not None and period < T < 2 * period:
         yield Note(

@@ -28,6 +28,9 @@ _CLIPPED_SAMPLES, _CLIPPED_RUN, _CLIPPED_RATIO, _NEIGHBOURS = 5, 3, 5, 5
 _SMOOTH = 0.01
 _LEVELS = 16  # a signal of so few values consists of levels, like a binary one; it is not clipped
 _REST = 0.05  # a signal that stays within this part of its rms does not move
+# A slow clock holds a signal for more than LEAST_HOLD samples, always as many, and changes it at
+# TICKS or more, at the share EACH of them at least: a binary signal changes at half of them.
+_TICKS, _LEAST_HOLD, _EACH = 20, 2, 0.8
 _SILENT = 1e-10  # power of a combination of inputs, relative to the largest, that counts as none
 
 
@@ -139,6 +142,17 @@ def moves(u: Array, parts: Integers) -> list[bool]:
     least = _REST * np.nanstd(u, axis=0)
     part = (u[first:end] for first, end in parts)
     return [bool(np.any(np.fmax.reduce(s) - np.fmin.reduce(s) > least)) for s in part]
+
+
+def held(u: Array) -> tuple[int, int] | None:
+    """Samples for which a slow clock holds signals u (T, nu), and its first one; else None."""
+    at = np.flatnonzero((np.diff(u, axis=0) != 0).any(axis=1)) + 1
+    if len(at) < _TICKS:
+        return None
+    between = np.diff(at)
+    hold = int(np.gcd.reduce(between))
+    clocked = hold > _LEAST_HOLD and np.mean(between == hold) > _EACH
+    return (hold, int(at[0] % hold)) if clocked else None
 
 
 def band(signal: Array, fs: float = 1.0) -> tuple[float, float] | None:

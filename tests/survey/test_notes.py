@@ -280,6 +280,26 @@ def test_oversampled(u):
     assert found(faster, lag(faster, noise=0)) == {}
 
 
+@pytest.mark.parametrize("skip", [0, 7])
+def test_inputs_that_a_slow_clock_holds(skip: int, rng):
+    """Those at which the inputs change are among the ones to keep."""
+    u = np.repeat(lfilter([0.2], [1, -0.8], rng.standard_normal(T // 20)), 20)
+    (said,) = notes_on(Record(u, lag(u, 0.98), fs=1000.0, skip=skip))
+    assert said.startswith("the inputs change every 20 samples only")
+    assert f"one sample in 5, sample {20 if skip else 0} among them" in said
+    assert "unless modes above 100 Hz matter" in said
+
+
+@pytest.mark.parametrize("pole", [0.5, 0.9])
+def test_steps_to_levels_are_no_slow_clock(pole: float, rng):
+    """The output settles within a step, or steps last for times of their own."""
+    levels = rng.uniform(-1, 1, T // 50)
+    even = np.repeat(levels, 50)
+    assert "held" not in found(even, lag(even, pole))
+    uneven = np.repeat(levels, rng.integers(30, 70, len(levels)))
+    assert "held" not in found(uneven, lag(uneven, 0.99))
+
+
 def test_periods(u):
     period = 3000
     u = np.resize(u[:period], T)
