@@ -12,6 +12,7 @@ import scipy
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.records import Record, as_records
 from lfrtorch.survey.causality import TwoSidedResponse, dead_time, two_sided_response
+from lfrtorch.survey.changes import change
 from lfrtorch.survey.integration import chain, grows, integrators, rates
 from lfrtorch.survey.measurement import Survey, survey_measurement
 from lfrtorch.survey.mechanics import reacting, rubs
@@ -91,7 +92,7 @@ def examine(
     u, y = u[found.whole], y[found.whole]
     if len(y) >= _ENOUGH:
         notes += _excitation(found, u, skipped)
-        notes += _relations(found, u, y, given or {})
+        notes += _relations(found, u, y, skipped + found.whole.start, given or {})
     return notes
 
 
@@ -337,8 +338,10 @@ def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
                 )
 
 
-def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> Iterator[Note]:
-    """How outputs (T, ny) without gaps follow inputs (T, nu): order, delay, drift."""
+def _relations(
+    found: Survey, u: Array, y: Array, skipped: int, given: Mapping[str, Any]
+) -> Iterator[Note]:
+    """How outputs (T, ny) without gaps follow inputs (T, nu): order, delay, drift, changes."""
     between = {
         (i, j): pair
         for i in range(y.shape[1])
@@ -434,6 +437,7 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
                 )
         if not integrates:
             yield from _drift(output, y[:, i], u)
+            yield from _change(output, y[:, i], u, skipped)
 
 
 def _repeats(one: SignalSurvey) -> bool:
@@ -464,6 +468,28 @@ def _drift(output: SignalSurvey, y: Array, u: Array) -> Iterator[Note]:
             f"output '{output.channel.name}' drifts by {slope * len(y):.3g} in the record, "
             f"{abs(slope) * len(y) / output.rms:.1f} times its rms, and no input does: take it "
             "off if the sensor drifts; leave it if the system integrates.",
+        )
+
+
+def _change(output: SignalSurvey, y: Array, u: Array, skipped: int) -> Iterator[Note]:
+    """Whether the gain from inputs (T, nu) to an output (T,) changes, or a sample is lost."""
+    found, name = change(u, y), output.channel.name
+    if found is None:
+        return
+    at = f"about sample {skipped + found.sample}"
+    if found.shift:
+        turn, side = ("sooner", "output") if found.shift > 0 else ("later", "inputs")
+        yield Note(
+            f"lost {name}",
+            f"from {at} on, '{name}' follows the inputs one sample {turn}: a sample of the {side} "
+            "may be lost, or clocks differ; if so, cut the record there.",
+        )
+    else:
+        yield Note(
+            f"gain {name}",
+            f"from {at} on, the gain from the inputs to '{name}' is {found.ratio:.2g} times that "
+            "before, at inputs of the same level: a setting or the system may have changed; if "
+            "so, cut the record there, or give what changed as an input.",
         )
 
 

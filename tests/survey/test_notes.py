@@ -370,6 +370,38 @@ def test_drift(u):
     assert found(u + line, lag(u + line)) == {}  # its cause is the input's
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e-9])
+def test_a_gain_that_changes(scale: float, u):
+    y = lag(np.tanh(u)) + 3.0
+    for gain in (0.5, 2.0):
+        said = found(scale * u, np.where(np.arange(T) < 2000, y, gain * y) / scale)
+        assert set(said) == {"gain"}
+        sample = int(said["gain"].split("sample ")[1].split()[0])
+        assert abs(sample - 2000) < 50
+        ratio = float(said["gain"].split(" times")[0].split()[-1])
+        assert ratio == pytest.approx(gain, rel=0.1)
+
+
+def test_a_gain_that_depends_on_the_level_does_not_change(u):
+    for level in (0.5, 2.0):
+        v = 0.3 * u + np.where(np.arange(T) < T / 2, 0.0, level)
+        assert "gain" not in found(v, lag(np.exp(v)))
+    louder = np.where(np.arange(T) < T / 2, u, 3 * u)
+    assert found(louder, np.tanh(lag(louder, 0.5))) == {}
+
+
+@pytest.mark.parametrize("pole", [0.5, 0.9])
+def test_a_lost_sample(pole: float, u):
+    y = lag(u, pole)
+    for at in (2000, 3000):
+        said = found(u[:-1], np.delete(y, at))
+        assert set(said) == {"lost"}
+        assert "a sample of the output may be lost" in said["lost"]
+        sample = int(said["lost"].split("sample ")[1].split()[0])
+        assert abs(sample - at) < 50
+        assert "a sample of the inputs may be lost" in found(np.delete(u, at), y[:-1])["lost"]
+
+
 def test_integrating_output(u):
     """Of all inputs, and no matter what the noise is; the line that it drifts along is its own."""
     y = lfilter([0, 1], np.poly([1.0, 0.9]), u + 0.1)
