@@ -312,7 +312,7 @@ def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
             yield Note(
                 "held",
                 f"the inputs change every {hold} samples only, and 99 % of the outputs' power lies "
-                f"below {highest:.3g} {unit}: one sample in {factor}, sample {first} "
+                f"below {highest:.3g} {unit}:\none sample in {factor}, sample {first} "
                 "among them, is enough for a faster fit, unless modes above "
                 f"{fs / (2 * factor):.3g} {unit} matter.",
             )
@@ -481,14 +481,14 @@ def _change(output: SignalSurvey, y: Array, u: Array, skipped: int) -> Iterator[
         turn, side = ("sooner", "output") if found.shift > 0 else ("later", "inputs")
         yield Note(
             f"lost {name}",
-            f"from {at} on, '{name}' follows the inputs one sample {turn}: a sample of the {side} "
+            f"from {at} on, '{name}' follows the inputs one sample {turn}:\na sample of the {side} "
             "may be lost, or clocks differ; if so, cut the record there.",
         )
     else:
         yield Note(
             f"gain {name}",
             f"from {at} on, the gain from the inputs to '{name}' is {found.ratio:.2g} times that "
-            "before, at inputs of the same level: a setting or the system may have changed; if "
+            "before, at inputs of the same level:\na setting or the system may have changed; if "
             "so, cut the record there, or give what changed as an input.",
         )
 
