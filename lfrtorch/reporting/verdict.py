@@ -138,9 +138,14 @@ class _Compared(NamedTuple):
         return self.typical or (whole and not (self.cross and self.middle >= 1.0))
 
     @property
+    def hidden(self) -> bool:
+        """Whether a runaway in one stretch hides what is so in most blocks."""
+        return self.typical and not self.ratio < 1.0 - self.same
+
+    @property
     def said(self) -> float:
         """The ratio to speak of: that of the blocks if a runaway hides it."""
-        return self.middle if self.typical and self.ratio > self.middle else self.ratio
+        return self.middle if self.hidden else self.ratio
 
 
 class _Errors(NamedTuple):
@@ -219,7 +224,8 @@ def judge(
     )
     kind, use, text = next(found for rule in _RULES if (found := rule(case)) is not None)
     if whole is not None and held_out and use != NEITHER:
-        used = whole.nrmse if use == NL_LFR else whole.linear_nrmse
+        own = whole.said * whole.linear_nrmse if whole.hidden else whole.nrmse
+        used = own if use == NL_LFR else whole.linear_nrmse
         if used >= EXPLAINS_NOTHING:
             use = NEITHER
             text = (
@@ -284,9 +290,9 @@ def _better(case: _Case) -> _Found | None:
         return refusal.kind, LINEAR_MODEL, text
     still = f" ({case.settled} settled)" if case.settled else ""
     constant = ", itself worse than a constant" if whole.linear_nrmse > 1.0 else ""
-    text = f"Better than {case.linear}{constant}: on {whole.name} the NL-LFR's {case.error} is " + (
-        f"{percent(whole.said)} of its" if constant or still else of_linear(whole.said)
-    )
+    text = f"Better than {case.linear}{constant}: on {whole.name} the NL-LFR's {case.error} is "
+    text += "in most blocks " * whole.hidden
+    text += f"{percent(whole.said)} of its" if constant or still else of_linear(whole.said)
     return Kind.BETTER, NL_LFR, text + still
 
 

@@ -119,6 +119,15 @@ def test_one_poor_stretch_does_not_decide_in_cross_validation(
     assert kinds == [cross, other]
 
 
+def test_a_verdict_that_a_runaway_hides_speaks_of_most_blocks():
+    part = np.where(np.arange(1000) // 100 == 4, 30.0, 0.4)
+    found = judge(result(), [TRAIN, response("validation", part, name=CROSS)])
+    assert found.evidence["ratio"] > 1.0
+    assert "on cross-validation the NL-LFR's error is in most blocks 5" in found.text
+    alike = judge(result(), [TRAIN, response("validation", 0.4, name=CROSS)])
+    assert "is 40.0 % of the linear model's" in alike.text
+
+
 def test_a_runaway_of_the_linear_model_in_one_stretch_is_no_merit_of_the_other():
     """Elsewhere the NL-LFR is worse: by the error of all it is better by far."""
     whole = response("validation", 1.3, name=CROSS)
