@@ -13,8 +13,8 @@ cases.
 Long records tell apart what is not worth a parameter (on the Silverbox 25 neurons are better than 5
 by 0.6 % and two standard errors), so a model within 1 % of the best does as well. Where a few
 resonances or impacts make up most of the error, one standard error can be a fifth of it, and the
-smallest model that is so near leaves out just these; so no model more than 5 % above the best does
-as well.
+smallest model that is so near leaves out just these; so by default no model more than 5 % above
+the best does as well.
 
 References:
     Hastie, Tibshirani and Friedman, "The Elements of Statistical Learning", 2nd ed., 2009, section

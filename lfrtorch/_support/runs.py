@@ -31,7 +31,7 @@ class Runs(NamedTuple):
 
 
 def is_run(name: str) -> bool:
-    """Whether a column is named as the number of a run is, as ``run`` or ``trial_id``."""
+    """Tell whether a column is named as the number of a run is, as ``run`` or ``trial_id``."""
     return _NAMES.fullmatch(name) is not None
 
 

@@ -71,7 +71,7 @@ class Piece(NamedTuple):
         return np.column_stack(lines) if lines else np.empty((len(k), 0))
 
     def missing(self) -> Booleans:
-        """Whether there is no sample at or next to a point of the grid."""
+        """Tell whether there is no sample at or next to a point of the grid."""
         k = self._grid()
         if len(self.places) < 2:
             return np.zeros(len(k), bool)
@@ -93,7 +93,7 @@ class EvenTimes(NamedTuple):
 
     @property
     def interpolated(self) -> bool:
-        """Whether samples are not as they came, but for those that are missing or left out."""
+        """Tell whether samples are not as they came, but for those that are missing or left out."""
         return any((np.rint(piece.places) != piece.places).any() for piece in self.pieces)
 
 
@@ -196,7 +196,7 @@ def sampling(t: Array) -> Sampling:
 
 
 def _rounded(t: Array, digit: float) -> bool:
-    """Whether all stamps are on one grid but for their last digit, which shows now and then."""
+    """Tell whether all stamps are on one grid but for a last digit that shows now and then."""
     steps, k = np.diff(t), np.arange(len(t)) - (len(t) - 1) / 2
     away = t - t.mean()
     away -= k * (k @ away) / (k @ k)  # the line of least squares is off by digit / sqrt(T)

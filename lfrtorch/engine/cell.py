@@ -166,7 +166,7 @@ class LFRCell(nn.Module):
 
     @property
     def autocast(self) -> bool:
-        """Whether ``torch.autocast`` would choose the dtypes; the layer keeps to its weights'."""
+        """Tell whether ``torch.autocast`` is on; the layer keeps to its weights' dtype."""
         device = self.A.device.type
         return device != "meta" and torch.is_autocast_enabled(device)
 

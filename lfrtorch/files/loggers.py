@@ -117,7 +117,7 @@ def _named(channel: Any) -> Channel:
 
 
 def _is_clock(channel: Any) -> bool:
-    """Whether a channel of TDMS has time stamps, or is named as time is."""
+    """Tell whether a channel of TDMS has time stamps, or is named as time is."""
     kind = channel.dtype.kind
     return kind == "M" or (kind in "iuf" and is_time(_named(channel)))
 

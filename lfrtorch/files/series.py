@@ -226,14 +226,14 @@ def _clocks(times: Sequence[Array], *, one: bool) -> list[_Clock]:
 
 
 def _even(t: Array, fs: float, hole: float) -> bool:
-    """Whether a clock runs evenly between holes."""
+    """Tell whether a clock runs evenly between holes."""
     holes = np.flatnonzero(np.diff(t) > hole) + 1
     off = np.split(t - np.arange(len(t)) / fs, holes)
     return all(np.abs(part - part[0]).max() <= _UNEVEN / fs for part in off)
 
 
 def _on_change(channel: _Channel, fastest: _Clock) -> bool:
-    """Whether a channel is logged when it changes: at no rate, and more seldom than another one."""
+    """Tell whether a channel is logged on change: at no rate, and more seldom than another."""
     t, fs = channel.clock.t, channel.clock.fs
     steps = np.diff(t)
     like = np.abs(steps / np.median(steps) - 1) <= _LIKE

@@ -130,7 +130,7 @@ class Table(ABC):
             self.notes = (*self.notes, note)
 
     def beside(self, column: int, columns: Sequence[int]) -> bool:
-        """Whether a column can be read with others."""
+        """Tell whether a column can be read with others."""
         return not self.lengths or self.lengths[column] == self.lengths[columns[0]]
 
     def where(self, sample: int) -> str:

@@ -133,7 +133,7 @@ def _beside(table: Table, named: Sequence[_Found], fs: float) -> TimeBase:
 
 
 def _agrees(fs: float, found: _Found) -> bool:
-    """Whether a column runs at a rate, if it is in ms, us or ns, too."""
+    """Tell whether a column runs at a rate, if it is in ms, us or ns, too."""
     return abs(fs / found.grid.fs / _thousands(fs / found.grid.fs) - 1) <= found.tolerance
 
 

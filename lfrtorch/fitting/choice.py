@@ -1,14 +1,16 @@
 """Sizes and ridge by cross-validation, and what the choice is worth on data that it has not seen.
 
 Four stretches of the estimation records are left out in turn (``lfrtorch.fitting.folds``). Linear
-and nonlinear models are fitted to the rest, and simulated through what was left out:
+and nonlinear models are fitted to the rest, simulated through what was left out, and begun in it
+from an estimated state, as on new data. Both errors count alike:
 
 1. The best linear approximations of several orders, each refined without the stretch.
 2. Nonlinear models from small to large: the first few sizes always, and larger ones as long as one
    of them lowers the error. Each is fitted from two starts along falling ridges, each ridge from
    where the last one ended, all towards the same start, and simulates by the mean of its starts.
-3. Of all sizes and ridges the fewest parameters are chosen that do as well as the best
-   (``lfrtorch.paired_blocks``), and of their ridges the largest.
+   A start that does not forget where it began (``lfrtorch.fitting.forgetting``) takes no part.
+3. Of a size the largest ridge is taken that does as well as its best one, and of the sizes the
+   fewest parameters that do about as well as the best (``lfrtorch.paired_blocks``).
 
 What a choice of many is worth is not its own error, which is the least of many. So the choice is
 made again without each of the stretches, and judged there (nested cross-validation): the errors of
@@ -363,10 +365,10 @@ def _chosen(
     sizes: dict[tuple[int, ...], list[int]] = {}
     for i, candidate in enumerate(tried):
         sizes.setdefault(tuple(candidate.sizes.values()), []).append(i)
-    # Of a size the largest ridge was tried first. If all diverge, none is as good as another.
+    # Of a size the largest ridge was tried first. Where all diverge, all are as good.
     best = [own[int(np.argmax(as_good(squares[own], blocks)))] for own in sizes.values()]
     good = as_good(squares[best], blocks, errors=_ERRORS, most=_MOST)
-    near = [tried[i] for i, enough in zip(best, good, strict=True) if enough or not good.any()]
+    near = [tried[i] for i, enough in zip(best, good, strict=True) if enough]
     return min(near, key=lambda c: c.parameters_net)
 
 
@@ -380,7 +382,7 @@ class _Linear(NamedTuple):
 
     @property
     def total(self) -> float:
-        """Sum of the squares, not 0."""
+        """Sum of the squares; the floor of each keeps it above 0."""
         return float(self.squares.sum())
 
 

@@ -1,4 +1,4 @@
-"""Whether a model forgets where it began: outputs from several start states meet.
+"""Memory of the start: outputs of a model from several start states meet, or stay apart.
 
 A model may have rests, or ways to move, that no data have shown. It then follows the data from the
 start state that was fitted, in stretches without measurements too, and from another one it stays
@@ -47,7 +47,7 @@ _LOOKED_AT = 200  # states at the end of a trajectory that is apart
 
 
 class Memory(NamedTuple):
-    """What outputs still show of the start state in the last third of the training records.
+    """Distance of outputs from several start states in the last third of the training records.
 
     Args:
         apart: largest rms distance of outputs from several starts, over the outputs' deviation;
@@ -69,12 +69,12 @@ class Memory(NamedTuple):
 
     @property
     def fades(self) -> bool:
-        """Whether the outputs meet, as far as the linear model's do."""
+        """Tell whether the outputs meet, as far as the linear model's do."""
         return self.apart <= max(LIMIT, _SLOWER * self.linear)
 
     @property
     def right(self) -> bool:
-        """Whether the model forgets, or remembers what the records have shown."""
+        """Tell whether the model forgets, or remembers what the records have shown."""
         return self.fades or self.visited
 
     def __str__(self) -> str:
@@ -96,7 +96,7 @@ class Memory(NamedTuple):
 def forgets(
     model: Model, records: Record | Sequence[Record], linear: LinearModel | Model | None = None
 ) -> Memory:
-    """How far a model forgets where it began, on the inputs of its training records.
+    """Measure how far a model forgets where it began, on the inputs of its training records.
 
     Args:
         model: what is simulated.
@@ -163,7 +163,7 @@ def _apart(
 
 
 def _visited(ends: Sequence[Tensor], paths: Sequence[Tensor]) -> bool:
-    """Whether the ends of trajectories are as near the records' own states as these to others."""
+    """Tell whether ends of trajectories are as near the records' states as these are to others."""
     states = np.concatenate([path.numpy() for path in paths])
     deviation = states.std(axis=0)
     deviation = np.where(deviation > 0.0, deviation, 1.0)

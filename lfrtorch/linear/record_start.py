@@ -52,7 +52,7 @@ class StartTrial(NamedTuple):
 
     @property
     def in_motion(self) -> bool:
-        """Whether rest is clearly worse."""
+        """Tell whether rest is clearly worse."""
         return self.estimated < _CLEARLY * self.zero
 
     def __str__(self) -> str:

@@ -208,7 +208,7 @@ class Evidence:
 
     @property
     def nothing_left(self) -> bool:
-        """Whether the residuals are white, and as large as the noise seems to be."""
+        """Tell whether the residuals are white, and as large as the noise seems to be."""
         if not self.guess or not self.white or self.train is None or self.noise:
             return False
         if self.falling > FALLING or (self.overfit or 0.0) > OVERFIT:

@@ -266,7 +266,7 @@ def training_deviations(responses: Sequence[Response]) -> tuple[Array, Array]:
 
 
 def has_settled(response: Response, deviations: tuple[Array, Array]) -> bool:
-    """Whether inputs and outputs stand still, against their deviations in training."""
+    """Tell whether inputs and outputs stand still, against their deviations in training."""
     signals = zip(_signals(response), deviations, strict=True)
     return all((signal.std(axis=0) <= _STILL * usual).all() for signal, usual in signals)
 

@@ -105,7 +105,7 @@ class Refusal(NamedTuple):
 
 
 REMEMBERS = Refusal("it does not forget where it began", Kind.LINEAR)
-"""Of a model whose output depends on its start for ever, where the records show no such thing."""
+"""Refusal of a model whose output depends for ever on its start, unlike the records."""
 
 
 class _Compared(NamedTuple):
@@ -139,7 +139,7 @@ class _Compared(NamedTuple):
 
     @property
     def hidden(self) -> bool:
-        """Whether a runaway in one stretch hides what is so in most blocks."""
+        """Tell whether a runaway in one stretch hides what is so in most blocks."""
         return self.typical and not self.ratio < 1.0 - self.same
 
     @property
@@ -160,7 +160,7 @@ class _Errors(NamedTuple):
 
 
 class _Case(NamedTuple):
-    """What the rules of a verdict look at."""
+    """Numbers that the rules of a verdict look at."""
 
     result: FitResult
     lost: Sequence[Response]  # on which the NL-LFR diverges
@@ -368,7 +368,7 @@ def judge_predictions(
 
 
 def _farther(ahead: int, verdict: Verdict) -> Refusal | None:
-    """What a verdict farther ahead refuses; nothing where neither model foresees anything."""
+    """Return what a verdict farther ahead refuses; None where neither model foresees anything."""
     ratio = verdict.evidence.get("ratio", math.inf)
     worse = verdict.kind == Kind.WORSE and (verdict.use != NEITHER or ratio >= _CLEAR)
     if verdict.kind == Kind.DIVERGES:
@@ -501,7 +501,7 @@ def _compared(
 
 
 def _is_cross(response: Response) -> bool:
-    """Whether it is of cross-validation, each stretch by other models."""
+    """Tell whether it is of cross-validation, each stretch by other models."""
     return response.record.name.endswith(CROSS)
 
 

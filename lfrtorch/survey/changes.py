@@ -109,6 +109,6 @@ def _fits(x: Array, y: Array) -> Array:
 
 
 def _same_levels(u: Array, v: Array) -> bool:
-    """Whether inputs (n, nu) and (m, nu) have the same levels."""
+    """Tell whether inputs (n, nu) and (m, nu) have the same levels."""
     before, after = (np.quantile(s, _LEVELS, axis=0) for s in (u, v))
     return bool(np.all(np.abs(before - after) < _ALIKE * np.std(np.vstack([u, v]), axis=0)))

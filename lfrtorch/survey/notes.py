@@ -441,7 +441,7 @@ def _relations(
 
 
 def _repeats(one: SignalSurvey) -> bool:
-    """Whether an input repeats so well that no noise is in it, as a controller would bring."""
+    """Tell whether an input repeats so well that no noise is in it, as a controller would bring."""
     return one.method == "periods" and one.noise is not None and one.noise < _PLANNED * one.rms
 
 
@@ -472,7 +472,7 @@ def _drift(output: SignalSurvey, y: Array, u: Array) -> Iterator[Note]:
 
 
 def _change(output: SignalSurvey, y: Array, u: Array, skipped: int) -> Iterator[Note]:
-    """Whether the gain from inputs (T, nu) to an output (T,) changes, or a sample is lost."""
+    """Tell whether the gain from inputs (T, nu) to an output (T,) changes, or a sample is lost."""
     found, name = change(u, y), output.channel.name
     if found is None:
         return

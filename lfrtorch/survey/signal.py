@@ -138,7 +138,7 @@ def longest_run(holds: Booleans) -> tuple[int, int]:
 
 
 def moves(u: Array, parts: Integers) -> list[bool]:
-    """Whether any of the signals u (T, nu) moves in parts (n, 2), from first to past end."""
+    """Tell whether any of the signals u (T, nu) moves in parts (n, 2), from first to past end."""
     least = _REST * np.nanstd(u, axis=0)
     part = (u[first:end] for first, end in parts)
     return [bool(np.any(np.fmax.reduce(s) - np.fmin.reduce(s) > least)) for s in part]
