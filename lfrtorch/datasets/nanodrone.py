@@ -26,10 +26,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
@@ -37,6 +38,9 @@ from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 __all__ = ["load"]
 
@@ -77,7 +81,8 @@ def _geodesic(y_hat: Float[Array, "n h 12"], y: Float[Array, "n h 12"]) -> Float
     """The angle of the rotation between two attitudes, rad."""
 
     def attitude(signal: Array) -> Rotation:
-        return Rotation.from_euler("xyz", signal[..., _ANGLES].reshape(-1, 3))
+        angles = signal[..., _ANGLES].reshape(-1, 3)
+        return scipy.spatial.transform.Rotation.from_euler("xyz", angles)
 
     there = np.asarray(np.isfinite(y_hat).all(axis=-1))
     y_hat = np.where(np.expand_dims(there, -1), y_hat, 0.0)
@@ -198,7 +203,8 @@ def _released(path: Path) -> tuple[Array, Array, float]:
     def columns(*wanted: str) -> Array:
         return table[:, [names.index(name) for name in wanted]]
 
-    attitude = Rotation.from_quat(columns("qx", "qy", "qz", "qw")).as_euler("xyz")
+    quaternions = columns("qx", "qy", "qz", "qw")
+    attitude = scipy.spatial.transform.Rotation.from_quat(quaternions).as_euler("xyz")
     y = [columns("x", "y", "z", "vx", "vy", "vz"), attitude, columns("wx", "wy", "wz")]
     u = columns(*(f"m{i}_rads" for i in range(1, 5)))
     return u, np.hstack(y), float(1.0 / np.median(np.diff(columns("t"), axis=0)))

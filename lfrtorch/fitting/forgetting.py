@@ -19,8 +19,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from lfrtorch._support.arguments import typed
@@ -168,7 +168,7 @@ def _visited(ends: Sequence[Tensor], paths: Sequence[Tensor]) -> bool:
     deviation = states.std(axis=0)
     deviation = np.where(deviation > 0.0, deviation, 1.0)
     parts = np.array_split(states / deviation, _PARTS)
-    trees = [KDTree(part) for part in parts]
+    trees = [scipy.spatial.KDTree(part) for part in parts]
     usual = np.concatenate(
         [
             np.min([tree.query(part)[0] for tree in trees if tree is not own], axis=0)
