@@ -16,16 +16,58 @@ if _typing.TYPE_CHECKING:
 __version__ = _version("lfrtorch")
 
 
+_ROOMS = ("analysis", "datasets", "distributed", "export", "reporting")
+_NAMES = {
+    "dataset": "Dataset Published",
+    "excitation": "multisine",
+    "files.load": "load_records",
+    "records": "Channel Record Scaler",
+    "linear.bla": "estimate_bla",
+    "linear.frf": "FRF estimate_frf",
+    "linear.model": "LinearFit LinearModel",
+    "linear.order_scan": "OrderScan scan_orders",
+    "engine.cell": "LFRCell",
+    "engine.lfr": "LFR",
+    "engine.nonlinearity": "Network Polynomial",
+    "extended_kalman_filter": "NoiseCovariance",
+    "known": "Known Parameter State",
+    "model": "Model load simulate_blocks",
+    "fitting.distillation": "distil",
+    "fitting.forgetting": "Memory forgets",
+    "fitting.means": "mean_model",
+    "fitting.multistart": "fit",
+    "fitting.noise_estimate": "estimate_noise",
+    "fitting.refit": "refit",
+    "fitting.choice": "Choice choose_sizes",
+    "fitting.snapshots": "Snapshots",
+    "fitting.starts": "initialise",
+    "fitting.trainer": "FitResult",
+    "_support.reasons": "Reason",
+    "least_squares.adam": "Adam",
+    "least_squares.levenberg_marquardt": "LevenbergMarquardt",
+    "fitting.settings": "Settings",
+    "fitting.observer": "Observer",
+    "job": "identify",
+    "reporting.preview": "Preview preview",
+    "reporting.run": "Run",
+    "metrics": "nrmse rmse",
+    "_support.errors": "InputError LfrtorchError",
+}
+_HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
+"""The module of each public name, in the order of ``_public.py``."""
+
+
 if not _typing.TYPE_CHECKING:  # a checker would take every name for one of these
+    __all__ = [*_ROOMS, *_HOME]  # noqa: PLE0604 (names of the tables)
 
     def __getattr__(name: str) -> object:
-        """Import the public names with the first that is asked for."""
-        if name == "__all__" or not name.startswith("_"):
-            public = _import_module("lfrtorch._public")
-            if name == "__all__" or name in getattr(public, "__all__", ()):
-                return getattr(public, name)
+        """Import a public name's module when it is asked for: a record needs no torch."""
+        if name in _ROOMS:
+            return _import_module(f"lfrtorch.{name}")
+        if name in _HOME:
+            return getattr(_import_module(f"lfrtorch.{_HOME[name]}"), name)
         raise AttributeError(f"module 'lfrtorch' has no attribute '{name}'")
 
     def __dir__() -> list[str]:
         own = (name for name in globals() if name.startswith("__"))
-        return sorted({*own, *__getattr__("__all__")})
+        return sorted({*own, *__all__})

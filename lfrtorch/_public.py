@@ -1,4 +1,4 @@
-"""The public names: the first that is asked for imports them all, and torch with them."""
+"""The public names at once; ``__init__.py`` imports each with the first use of it."""
 
 from lfrtorch import analysis, datasets, distributed, export, reporting
 

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import lfrtorch
+from lfrtorch import _public
 from lfrtorch.cli.command import COMMANDS, versions
 from lfrtorch.datasets import boucwen, official
 from lfrtorch.reporting import plots
@@ -152,14 +153,20 @@ def test_import_takes_what_it_needs_and_no_more():
     assert "numpy" not in loaded("import lfrtorch")
     code = "import lfrtorch, torch; lfrtorch.identify; from lfrtorch.engine.cell import LFRCell; "
     code += "torch.set_default_device('meta'); LFRCell(1, 1, 2)"
-    assert loaded(code).isdisjoint([*HEAVY, "torch._dynamo"])
+    assert loaded(code).isdisjoint([*HEAVY, "torch._dynamo", "scipy.spatial"])
+
+
+@pytest.mark.parametrize("name", ["Record", "Dataset", "multisine", "nrmse", "InputError"])
+def test_what_computes_no_model_imports_nothing_that_does(name: str):
+    others = {"torch", "scipy", "numba", "safetensors", "jaxtyping", *HEAVY}
+    assert loaded(f"import lfrtorch; lfrtorch.{name}").isdisjoint(others)
 
 
 def test_the_package_shows_its_public_names_and_no_others():
     shown = {name for name in dir(lfrtorch) if not name.startswith("__")}
-    assert shown == set(lfrtorch.__all__)
+    assert shown == set(lfrtorch.__all__) == set(_public.__all__)
     for name in shown:
-        getattr(lfrtorch, name)
+        assert getattr(lfrtorch, name) is getattr(_public, name)
     of_the_library = {"Any", "TYPE_CHECKING", "import_module", "version"}
     assert not [name for name in of_the_library if hasattr(lfrtorch, name)]
 
