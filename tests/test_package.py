@@ -162,6 +162,10 @@ def test_what_computes_no_model_imports_nothing_that_does(name: str):
     assert loaded(f"import lfrtorch; lfrtorch.{name}").isdisjoint(others)
 
 
+def test_a_single_fit_imports_no_tables_of_several():
+    assert loaded("import lfrtorch.cli.fit").isdisjoint(["pandas", "scipy.signal"])
+
+
 def test_the_package_shows_its_public_names_and_no_others():
     shown = {name for name in dir(lfrtorch) if not name.startswith("__")}
     assert shown == set(lfrtorch.__all__) == set(_public.__all__)

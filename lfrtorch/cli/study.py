@@ -35,7 +35,6 @@ from hydra_plugins.lfrtorch_ray import RayLauncherConf
 from lfrtorch._support import tables
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import CUT_SHORT
-from lfrtorch.cli import compare
 from lfrtorch.cli.claim import tidy
 from lfrtorch.cli.composition import SWEEPS, parsed
 from lfrtorch.cli.errors import user_errors
@@ -263,6 +262,8 @@ class Report(Callback):
         try:
             if ended:
                 print()
+                from lfrtorch.cli import compare  # pandas takes its time, and one run has no table
+
                 with user_errors():
                     compare.run([folder])
         finally:  # Hydra would make a warning of an error, and exit with 0
