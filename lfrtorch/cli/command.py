@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import sys
 from importlib import import_module
@@ -46,7 +47,11 @@ def start(command: str) -> None:
             from lfrtorch.cli import early
 
             early.check("config" if command == "fit" else command)
-        import_module(f"lfrtorch.cli.{command}").launch()
+        gc.disable()  # until all is imported: there is much of it, and nothing in it is garbage
+        module = import_module(f"lfrtorch.cli.{command}")
+        gc.freeze()
+        gc.enable()
+        module.launch()
     else:
         import hydra
 

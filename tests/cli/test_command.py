@@ -1,5 +1,6 @@
 """The command ``lfrtorch``: its help, at once and of its own settings."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -35,6 +36,13 @@ HELP = {
 
 OWN = {"linear": ("data/file", "bla/state_space"), "evaluate": ("data/file",)}
 """Files of settings that the help of a command lists."""
+
+
+def test_garbage_is_collected_again_when_all_is_imported(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lfrtorch evaluate"])
+    monkeypatch.setattr("lfrtorch.cli.evaluate.launch", lambda: None)
+    command.start("evaluate")
+    assert gc.isenabled()
 
 
 @pytest.mark.parametrize("word", HELP)
