@@ -1,4 +1,5 @@
 PYTHON ?= python3
+ORACLE_PYTHON ?= python3.12
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
@@ -6,7 +7,7 @@ PARTIAL := $(VENV)/.partial
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-all test-machines test-min test-latest torture mutants coverage check bench first-try reproduce docs docs-links audit dist clean
+.PHONY: help setup run test test-all test-machines test-min test-latest torture oracle mutants coverage check bench first-try reproduce docs docs-links audit dist clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -41,6 +42,11 @@ mutants: $(READY)  ## faults put into the numerical core: does a test notice? (u
 
 torture: $(READY)  ## kills, full disks, damaged files, nonsense: the page docs/measured/torture.md (two hours; ARGS='--only files')
 	@PYTHONPATH=tests $(BIN)/python tests/torture.py $(ARGS)
+
+oracle: $(READY)  ## the numerical core beside another implementation, in .oracle (ORACLE_PYTHON=python3.12)
+	@[ -x .oracle/bin/python ] || $(ORACLE_PYTHON) -m venv .oracle
+	@.oracle/bin/python -m pip install -qq --disable-pip-version-check freq-statespace==0.2.0
+	@$(BIN)/python -m pytest -m "" tests/test_foreign_oracle.py $(ARGS)
 
 check: $(READY)  ## format, lint, types, import order
 	@$(BIN)/ruff format --check .
