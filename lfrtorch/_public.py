@@ -17,7 +17,9 @@ from lfrtorch.linear.order_scan import OrderScan, scan_orders
 # the nonlinear model
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.polynomial import Polynomial
+from lfrtorch.maps.static_map import StaticMap
 from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.known import Known, Parameter, State
 from lfrtorch.model import Model, load, simulate_blocks
@@ -82,6 +84,7 @@ __all__ = [
     "Settings",
     "Snapshots",
     "State",
+    "StaticMap",
     "analysis",
     "choose_sizes",
     "datasets",

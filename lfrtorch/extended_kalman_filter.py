@@ -136,11 +136,10 @@ class ExtendedKalmanFilter(StateObserver):
         self._left: list[Any] = []
         if self._weights is not None:
             w, tail = self._weights, (self._G, self._x_now, self._U)
-            ahead = [*w[:5], *w[8:]]  # without Cy, Dyu and Dyw
             self._filter = [*w, *tail]
             self._corrector = [self._u_now, self._y_now, *w, *tail, self._w_hat]
             after: list[Any] = [self._w_hat, self._x_now, self._U]
-            self._advancer = [self._u_now, *ahead], after
+            self._advancer = [self._u_now, *w], after
 
     @property
     def covariance(self) -> Float[Array, "n n"]:

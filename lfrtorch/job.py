@@ -20,8 +20,6 @@ from lfrtorch._support.threads import each_alone
 from lfrtorch.analysis.physical_parameters import physical_parameters
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
-from lfrtorch.engine.nonlinearity import is_network, known_parts
-from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.files.split import cut
 from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.exclusions import allowed
@@ -217,9 +215,8 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
             f"{percent(max(apart for _, apart in found))} of a matrix's largest entry at most"
         )
     settings, models = begun_on_part(replace(stage, settings=settings), models)
-    average = _most_averaged(models, settings.average, observer)
     samples = sum(record.samples for record in dataset.train)
-    if samples >= SLOW_SAMPLES and not is_compiled(cell := models[0].lfr.cell, cell.A.cpu()):
+    if samples >= SLOW_SAMPLES and models[0].lfr.cell.map.code is None:
         observer.say(
             "note: the static map is a module of your own, which is not compiled: an iteration "
             "takes some ten times as long as with a network or a polynomial"
@@ -235,7 +232,7 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
         dataset.train,
         dataset.validation,
         dataset.selection,
-        average=average,
+        average=settings.average,
         monitors=monitors,
         watch=watch,
         snapshots=snapshots,
@@ -303,14 +300,6 @@ def _of_choice(settings: Settings, choice: Choice) -> Settings:
     )
 
 
-def _most_averaged(models: Sequence[Model], average: int, observer: Observer) -> int:
-    """How many starts the mean may have: ``average``, and 1 if the models are not networks."""
-    if average == 1 or all(is_network(model.lfr.cell.static) for model in models):
-        return average
-    observer.say("note: average is for networks; the best start is kept")
-    return 1
-
-
 def scored_run(
     stage: Stage,
     settings: Settings,
@@ -373,7 +362,7 @@ def scored_run(
         residuals=residuals,
     )
     known = None
-    if known_parts(model.lfr.cell.static) is not None:
+    if model.known_states:
         of = dataset.train if again is None else estimation_records(dataset)
         ridge = 0.0 if isinstance(settings.ridge, Mapping | str) else settings.ridge
         if begins_at_outputs(of) and settings.horizon is not None:

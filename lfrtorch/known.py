@@ -15,8 +15,8 @@ import torch
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, number, reals
 from lfrtorch._support.errors import InputError
-from lfrtorch.engine.known_map import METHODS, KnownEquations, KnownMap
-from lfrtorch.engine.operations import Formula, UntraceableError
+from lfrtorch.maps.known_map import METHODS, KnownEquations, KnownModel
+from lfrtorch.maps.operations import Formula, UntraceableError
 
 
 @typed()
@@ -240,9 +240,9 @@ class Known:
         how = self.method, self.substeps, self.centred
         return KnownEquations(f, h, *names, units, nu, *how)
 
-    def map(self, nu: int, outputs: Sequence[str], fs: float) -> KnownMap:
+    def map(self, nu: int, outputs: Sequence[str], fs: float) -> KnownModel:
         """The equations as a static map of an LFR, of signals in physical units, in float64."""
-        found = KnownMap(self.equations(nu, outputs), 1.0 / fs, dtype=torch.float64)
+        found = KnownModel(self.equations(nu, outputs), 1.0 / fs, dtype=torch.float64)
         with torch.no_grad():
             for i, parameter in enumerate(self.parameters.values()):
                 found.p_scale[i] = parameter.size

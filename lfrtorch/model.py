@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -26,7 +25,6 @@ from lfrtorch.data_reach import Cloud, DataReach
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, fixed_entries
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, levels, listed, system_lines
-from lfrtorch.engine.direct_sum import DirectSum
 from lfrtorch.engine.disturbance import (
     disturbance_scale,
     disturbed_cell,
@@ -35,10 +33,8 @@ from lfrtorch.engine.disturbance import (
 )
 from lfrtorch.engine.initial_state import estimated_start, measured_start
 from lfrtorch.engine.innovation import predictor_cell, split_predictor
-from lfrtorch.engine.known_map import KnownEquations, KnownMap
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import static_slope
-from lfrtorch.engine.nonlinearity import Beyond, Network, Polynomial, base_of, known, known_parts
 from lfrtorch.engine.operating_point import double, equilibrium, linear_part, linearised_at
 from lfrtorch.engine.resampling import resampled_cell
 from lfrtorch.engine.simulation import Trajectory, simulate
@@ -48,6 +44,7 @@ from lfrtorch.extended_kalman_filter import (
     inside_limits,
     with_variances,
 )
+from lfrtorch.maps.descriptions import foreign, made
 from lfrtorch.records import (
     Channel,
     NormalisedRecord,
@@ -196,14 +193,14 @@ class Model:
         sizes = ", ".join(f"{name} {size}" for name, size in self.sizes.items())
         sizes = f"{self.known_states} known states, {sizes}" if self.known_states else sizes
         counts = f"{self.parameter_count} parameters, {self.net_parameter_count} net"
-        maps = [*cell.static.parts] if isinstance(cell.static, DirectSum) else [cell.static]
+        first, *others = map(str, cell.map.maps)
         facts = [
             ("sampled at", f"{self.fs:g} Hz"),
             ("inputs", levels(self.inputs, scaler.u_offset, scaler.u_scale)),
             ("outputs", levels(self.outputs, scaler.y_offset, scaler.y_scale)),
             ("sizes", f"{sizes}; {counts}"),
-            ("static map", "" if cell.static is None else str(maps[0]).split("\n")[0]),
-            *(("beside it", str(one)) for one in maps[1:]),
+            ("static map", first.split("\n")[0] if cell.nw else ""),
+            *(("beside it", other) for other in others),
             ("fitted to", self.fitted_to),
             ("noise", "" if self.K is None else "innovation form: model.predict, model.observer"),
             ("rest", rest),
@@ -218,22 +215,15 @@ class Model:
     @property
     def sizes(self) -> dict[str, int]:
         """nx, nz, nw, and nn or the degree of a polynomial; nn = 0 for a map of the user's own."""
-        cell = self.lfr.cell
-        sizes = {"nx": cell.nx, "nz": cell.nz, "nw": cell.nw}
-        if (parts := known_parts(cell.static)) is not None:
-            first, learned = parts
-            sizes = {
-                "nx": cell.nx - first.nx, "nz": cell.nz - first.nz, "nw": cell.nw - first.nw
-            }  # fmt: skip
-            return sizes | ({"nn": 0} if learned is None else learned.sizes)
-        static = known(base_of(cell.static))
-        return sizes | ({"nn": 0} if static is None else static.sizes)
+        cell, learned = self.lfr.cell, self.lfr.cell.map.learned
+        nx = cell.nx - self.known_states
+        return {"nx": nx, "nz": learned.nz, "nw": learned.nw, **learned.sizes}
 
     @property
     def known_states(self) -> int:
         """Number of states of the known model, the first ones; 0 if there is none."""
-        parts = known_parts(self.lfr.cell.static)
-        return 0 if parts is None else parts[0].nx
+        known = self.lfr.cell.map.known
+        return 0 if known is None else known.nx
 
     @property
     def state_covariance(self) -> Float[Array, "nx nx"]:
@@ -309,21 +299,12 @@ class Model:
         gauge = max(0, cell.nx**2 // halves - given) + predicting
         if cell.structure == "parallel":
             return self.parameter_count - gauge - cell.nz - cell.nw
-        static = base_of(cell.static)
-        if (parts := known_parts(static)) is not None:
-            states = cell.nx - parts[0].nx
-            sizes = 0 if parts[1] is None else (cell.nz - parts[0].nz, cell.nw - parts[0].nw)
-            return self.parameter_count - states**2 - sum(size**2 for size in sizes or ())
-        if not isinstance(static, Network | Polynomial):
-            return self.parameter_count - gauge
+        if self.known_states:  # its matrices are given
+            learned = cell.map.learned
+            return self.parameter_count - self.sizes["nx"] ** 2 - learned.redundant(learned.nz)
         fed = cell.nx // halves * (cell.structure != "hammerstein")
         fed += (cell.nu - cell.past_outputs) * z_free
-        nz = min(cell.nz, fed)
-        gauge += (cell.nz - nz) * fed + nz**2 + cell.nw**2 + max(0, cell.nw - cell.ny)
-        if isinstance(static, Polynomial):
-            terms = [math.comb(n + static.degree, n) for n in (nz, cell.nz)]
-            return self.parameter_count - gauge - cell.nw * (terms[1] - terms[0] + nz)
-        return self.parameter_count - gauge - len(static.bz) * (cell.nz - nz)
+        return self.parameter_count - gauge - cell.map.redundant(fed, cell.ny)
 
     @typed("data")
     def simulate(
@@ -773,7 +754,7 @@ class Model:
         cell, s = self.lfr.cell, self.scaler
         description = {
             "sizes": {"nu": cell.nu, "ny": cell.ny, "nx": cell.nx, "nz": cell.nz, "nw": cell.nw},
-            "static": _described(cell.static),
+            "static": cell.map.describe(),
             "dtype": str(cell.A.dtype).removeprefix("torch."),
             "fs": self.fs,
             "inputs": [c._asdict() for c in self.inputs],
@@ -824,11 +805,16 @@ def simulate_blocks(
         >>> np.array_equal(y_hat, model.simulate(record.u))
         True
     """
-    first, state = 0, np.zeros(model.lfr.cell.nx) if x0 is None else x0
+    # States keep all their digits from block to block, and signals those that the model has.
+    cell, scaler, like = double(model.lfr.cell), model.scaler, model.lfr.cell.A
+    first, state = 0, torch.zeros(1, cell.nx, dtype=torch.float64)
+    if x0 is not None:
+        state = model.signals(np.zeros((1, cell.nu)), start="given", x0=x0).x[:, 0].double()
     for block in blocks:
         u = as_signal(block, model.inputs, "input", first=first)
-        trajectory = model.signals(u, start="given", x0=state)
-        y = model.scaler.restore_y(trajectory.y[0].double().numpy())
+        v = torch.as_tensor(scaler.normalise_u(u)).to(like).unsqueeze(0)
+        trajectory = simulate(cell, v.cpu().double(), state)
+        y = scaler.restore_y(trajectory.y[0].to(like.dtype).double().numpy())
         lost = ~np.isfinite(y).all(axis=1)
         if lost.any():
             raise InputError(
@@ -836,7 +822,7 @@ def simulate_blocks(
                 "are the inputs in its units, and no louder than those that it was fitted to?"
             )
         yield y
-        first, state = first + len(u), trajectory.x[0, -1].numpy()
+        first, state = first + len(u), trajectory.x[:, -1]
 
 
 def state_moment(model: Model, records: Record | Sequence[Record]) -> Float[Tensor, "nx nx"]:
@@ -849,50 +835,19 @@ def state_moment(model: Model, records: Record | Sequence[Record]) -> Float[Tens
     return (total + total.mT) / (2 * samples)
 
 
-_OWN_TYPES = "Network", "Polynomial", "Known", "DirectSum"
-"""Static maps that a checkpoint describes."""
-
-
-def _described(static: Module | None) -> dict[str, Any] | None:
-    """Describe a static map for a checkpoint."""
-    if static is None:
-        return None
-    if isinstance(static, KnownMap):
-        equations = static.equations.described()
-        return {"type": "Known", "equations": equations, "sample_time": static.sample_time}
-    if isinstance(static, DirectSum):
-        parts = [_described(part) for part in static.parts]
-        return {"type": "DirectSum", "parts": parts, "sizes": static.sizes_of_parts}
-    if isinstance(static, Beyond):
-        return {"type": "Beyond", "base": _described(static.base)}
-    match known(static):
-        case Network() as network:
-            return {"type": "Network", **network.sizes, "activation": network.activation}
-        case Polynomial() as polynomial:
-            return {"type": "Polynomial", **polynomial.sizes}
-    return {"type": "own", "class": type(static).__qualname__}
-
-
-def _made(
-    description: Any, nz: int, nw: int, dtype: torch.dtype, own: Module | None
-) -> Module | None:
-    """Return the static map of a description, its weights yet to be loaded."""
-    match description:
-        case {"type": "Beyond", "base": base}:
-            if (found := _made(base, nz, nw, dtype, own)) is None:
-                raise InputError("the static map that a linear one is taken off is missing")
-            return Beyond(found, torch.zeros(nw, nz), torch.eye(nz), torch.eye(nw))
-        case {"type": "Known", "equations": equations, "sample_time": sample_time}:
-            return KnownMap(KnownEquations.of(equations), float(sample_time), dtype=dtype)
-        case {"type": "DirectSum", "parts": parts, "sizes": of_parts}:
-            pairs = zip(parts, of_parts, strict=True)
-            made = [_made(part, n_z, n_w, dtype, own) for part, (n_z, n_w) in pairs]
-            return DirectSum([part for part in made if part is not None], of_parts)
-        case {"type": "Network", "nn": nn, "activation": activation}:
-            return Network(nz, nw, nn, activation, dtype=dtype)
-        case {"type": "Polynomial", "degree": degree}:
-            return Polynomial(nz, nw, degree, dtype=dtype)
-    return own
+def _folded(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The weights of a model with f in the place of its map w = W (f(Z z) - L Z z)."""
+    L, Z, W = (weights.pop(f"static.{name}") for name in ("slope", "into", "out"))
+    found = {name.replace("static.base.", "static.", 1): weight for name, weight in weights.items()}
+    for name in ("Cz", "Dzu", "reach.middle"):
+        found |= {name: Z @ found[name]} if name in found else {}
+    if "reach.axes" in found:
+        found["reach.axes"] = found["reach.axes"] @ torch.linalg.inv(Z)
+    for into, of_x, of_u in (("Bw", "A", "Bu"), ("Dyw", "Cy", "Dyu")):
+        found[into] = found[into] @ W
+        found[of_x] = found[of_x] - found[into] @ L @ found["Cz"]
+        found[of_u] = found[of_u] - found[into] @ L @ found["Dzu"]
+    return found
 
 
 @typed()
@@ -919,14 +874,13 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             f"'{folder}' holds a linear model, as estimate_bla makes it; "
             "read it with lfrtorch.LinearModel.load."
         )
-    made = description.get("static")
-    own = made
-    while isinstance(own, dict) and own.get("type") == "Beyond":
-        own = own.get("base")
-    if isinstance(own, dict) and own.get("type") not in _OWN_TYPES and not static:
+    own, folds = description.get("static"), 0
+    while isinstance(own, dict) and own.get("type") == "Beyond":  # canonical forms of before
+        own, folds = own.get("base"), folds + 1
+    if not static and (name := foreign(own)):
         raise InputError(
-            f"'{folder}' holds a static nonlinearity of class {own.get('class')}, which is not "
-            "part of this package; pass an instance of it: load(folder, static=...)."
+            f"'{folder}' holds a static nonlinearity of class {name}, which is not part of this "
+            "package; pass an instance of it: load(folder, static=...)."
         )
     if isinstance(own, dict) and own.get("layers", 1) != 1:
         raise InputError(
@@ -942,10 +896,12 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         lost = [name for name in finite if not weights[name].isfinite().all()]
         if lost:
             raise InputError(f"{', '.join(lost)} have numbers that are not finite")
+        for _ in range(folds):
+            weights = _folded(weights)
         scaler = Scaler(*(weights.pop(f"scaler.{name}").numpy() for name in _SCALING))
         if weights["A"].shape != (sizes["nx"],) * 2:
             raise InputError("they are of other sizes")
-        static = _made(made, sizes["nz"], sizes["nw"], dtype, static)
+        static = made(own, sizes["nz"], sizes["nw"], dtype, static)
         cell = LFRCell(**sizes, static=static, dtype=dtype, random=False).to(dtype)
         K = weights.pop("K", None)
         for name in [n for n in weights if n.startswith("fixed.")]:

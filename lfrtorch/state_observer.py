@@ -18,9 +18,7 @@ from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import known_parts
-from lfrtorch.engine.simulation import folded, is_compiled, kernel_arguments
-from lfrtorch.engine.simulation_kernel import simulate_record
+from lfrtorch.engine.simulation_kernel import simulate_records
 from lfrtorch.records import Channel, Scaler
 
 
@@ -54,16 +52,16 @@ class StateObserver(ABC):
         x0: ArrayLike,
         disturbances: int = 0,
     ) -> None:
-        cell = folded(deepcopy(cell).double().cpu())
+        cell = deepcopy(cell).double().cpu()
         self._own = cell.nx - disturbances
         self._cell, self._scaler, self._inputs, self._outputs = cell, scaler, inputs, outputs
         self._u, self._x = np.zeros((1, 1, cell.nu)), np.zeros((1, 2, cell.nx))
         z, w, self._y = (np.zeros((1, 1, size)) for size in (cell.nz, cell.nw, cell.ny))
-        compiled = is_compiled(cell, cell.A.detach()) and known_parts(cell.static) is None
-        self._weights = kernel_arguments(cell) if compiled else None
+        numbers = cell.weights()
+        self._weights = numbers.arguments if numbers.layout.compiled else None
         self._call: list[Any] | None = None
         if self._weights is not None:
-            self._call = [0, self._u, *self._weights, 0.0, self._x, z, w, self._y]
+            self._call = [0, 1, 1, *self._weights, self._u, -1.0, self._x, z, w, self._y]
         self._predicted, self._corrected = False, False
         fed_back = bool(cell.Dyw.any()) and bool(cell.Dzu.any())
         self._feedthrough = bool(cell.Dyu.any()) or fed_back
@@ -207,7 +205,7 @@ class StateObserver(ABC):
         """Write the output and the next states without noise."""
         if self._call is not None:
             self._x_next.fill(np.nan)  # no trajectory that this one could meet
-            simulate_record(*self._call)
+            simulate_records(*self._call)
         else:
             with torch.no_grad():
                 y, x = self._cell(torch.as_tensor(self._u[0]), torch.as_tensor(self._x[0, :1]))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,9 +14,10 @@ from torch.func import jacrev
 from lfrtorch import Known, LFRCell, Network, NoiseCovariance
 from lfrtorch._support.types import Array
 from lfrtorch.analysis import canonical
-from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import Matrices
-from lfrtorch.engine.direct_sum import DirectSum
+from lfrtorch.maps.activations import ACTIVATIONS
+from lfrtorch.maps.direct_sum import DirectSum
+from lfrtorch.maps.static_map import StaticMap
 from lfrtorch.model import Model
 
 Step = Callable[[Array, Array], tuple[Array, Array]]
@@ -27,8 +29,20 @@ def in_canonical_form(model: Model) -> Model:
     return canonical(model, measure(model, 60, seed=1)).model
 
 
-def known_model() -> Model:
-    """Two tanks with an overflow, a network of each activation of the table beside it, a state."""
+class Drag(StaticMap):
+    """Equations of one's own, and nothing else: a result of each z, and a constant."""
+
+    def __init__(self) -> None:
+        super().__init__(nz=2, nw=3)
+        self.a = torch.nn.Parameter(torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64))
+
+    def equations(self, z: Sequence[Any], phi: Sequence[Any]) -> Sequence[Any]:
+        """w of z."""
+        return [phi[0] * z[0] * abs(z[0]), torch.tanh(z[1]) * phi[1], 2.0 * phi[2]]
+
+
+def known_model(beside: StaticMap) -> Model:
+    """Two tanks with an overflow by many operations, and a map beside them."""
 
     def rates(x, u, p):
         def drain(level):
@@ -47,12 +61,12 @@ def known_model() -> Model:
         substeps=2, intersample="bl",
     )  # fmt: skip
     own = known.map(2, ["y1", "y2", "y3"], 4.0)
-    network = Network(2, 1, 4, "softplus", dtype=torch.float64)
-    static = DirectSum([own, network], [(own.nz, own.nw), (2, 1)])
-    cell = LFRCell(2, 3, 3, own.nz + 2, own.nw + 1, static, dtype=torch.float64, random=False)
+    static = DirectSum([own, beside], [(own.nz, own.nw), (beside.nz, beside.nw)])
+    cell = LFRCell(2, 3, 3, static.nz, static.nw, static, dtype=torch.float64, random=False)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        network.reset_parameters(generator)
+        for p in beside.parameters():
+            p.uniform_(-1.0, 1.0, generator=generator)
         for name in Matrices._fields:
             cell.get_parameter(name).uniform_(-0.1, 0.1, generator=generator)
         cell.Cz[:2, :2], cell.Dzu[2:4] = torch.eye(2), torch.eye(2)
@@ -65,18 +79,18 @@ MODELS: dict[str, Model] = {
     "polynomial": random_model(polynomial_cell(2, 2, 3)),
     "affine": random_model(polynomial_cell(1, 1, 1)),
     "linear": random_model(random_cell(2, 2, 3, 0, 0)),
-    "canonical": in_canonical_form(random_model(random_cell(2, 3, 4, 2, 3, 5))),
-    "known": known_model(),
+    "known": known_model(Network(2, 1, 4, "softplus", dtype=torch.float64)),
+    "drag": random_model(random_cell(2, 1, 3, 2, 3, static=Drag(), radius=0.5)),
     "smallest": random_model(random_cell(1, 1, 1, 1, 1, 1), fs=750.0),
 }
-"""Every activation, polynomials, no static map, a canonical form, a known model, one of all."""
+"""Every activation, polynomials, no static map, a known model, own equations, one of all."""
 
 
 OBSERVED: dict[str, Model] = {
     name: replace(
         MODELS[name], K=0.1 * normal(MODELS[name].lfr.cell.nx, len(MODELS[name].outputs), seed=2)
     )
-    for name in ("softplus", "polynomial", "linear", "canonical", "smallest")
+    for name in ("softplus", "polynomial", "linear", "drag", "smallest")
 }
 """Models with a gain K."""
 

@@ -17,13 +17,13 @@ import torch
 from numba import config
 
 import lfrtorch
-from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.direct_sum import DirectSum
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
-from lfrtorch.engine.simulation_kernel import simulate_record
+from lfrtorch.engine.simulation_kernel import simulate_records
 from lfrtorch.extended_kalman_filter import NoiseCovariance
+from lfrtorch.maps.activations import ACTIVATIONS
+from lfrtorch.maps.direct_sum import DirectSum
 
 MANY_STATES = 9
 """Rows of so many states go through other kernels."""
@@ -176,9 +176,9 @@ def planted() -> None:
     observer = made.observer(noise=NoiseCovariance(1, 1))
     call = observer._call  # pyright: ignore[reportAttributeAccessIssue]
     assert call is not None
-    call[1] = np.zeros((1, 1, 2))
+    call[6] = np.zeros((1, 1, 2))
     try:
-        simulate_record(*call)
+        simulate_records(*call)
     except IndexError:
         return
     raise AssertionError("an index beyond an array was not noticed")

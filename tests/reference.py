@@ -17,12 +17,13 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.linear.refinement import Refined
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, Scaler, Start
 

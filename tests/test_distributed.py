@@ -169,9 +169,9 @@ def slope(ranks: Ranks) -> dict[str, Any]:
     model, train, _ = case()
     problem = Problem.of(model, train, ridge=1e-2, ranks=ranks)
     at = problem.theta + 0.01
-    r, gradient = problem.gradient(at)
+    point, gradient = problem.gradient(at)
     system, product = problem.linearise(at).system(0.0, 1e-12)
-    found = {"cost": torch.tensor(problem.cost(r)), "rmse": torch.tensor(problem.rmse(at))}
+    found = {"cost": torch.tensor(point.cost), "rmse": torch.tensor(problem.rmse_at(point))}
     found |= {"gradient": gradient, "product": product, "scale": torch.tensor(system.scale)}
     return found | {"step": system.solve(product, 0.1), "start": problem.theta}
 

@@ -9,7 +9,7 @@ from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from lfrtorch.engine import linearised, sensitivity
-from lfrtorch.least_squares import jacobian
+from lfrtorch.least_squares import jacobian, output_rows
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.records import Record, Start
@@ -86,7 +86,7 @@ def test_rows_by_spectral_line_are_held_once(blocks: int):
     samples = 8192
     plain, _ = peak_of_an_iteration(samples, "periodic")
     peak, _ = peak_of_an_iteration(samples, "periodic", lines=np.ones(samples // 2 + 1))
-    copies = 4 * 8 * samples * jacobian.SPECTRA  # the columns, their spectra, and real again
+    copies = 4 * 8 * samples * output_rows.SPECTRA  # the columns, their spectra, and real again
     assert peak < plain + copies
 
 

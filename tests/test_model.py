@@ -19,11 +19,12 @@ from lfrtorch._support.tables import UNKNOWN
 from lfrtorch.engine.block_form import zeros_of
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.newton import newton_states
-from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.engine.simulation import simulate, steady_state
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model, load
 from lfrtorch.records import Channel, Record

@@ -53,7 +53,8 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
         str(path.relative_to(ROOT)) for room in rooms for path in (ROOT / room).rglob("*.py")
     }
     settings = {f"lfrtorch/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
-    templates = (ROOT / "lfrtorch").rglob("templates/*")
+    folders = (ROOT / "lfrtorch").rglob("templates")
+    templates = [path for folder in folders for path in folder.rglob("*") if path.is_file()]
     others = {"lfrtorch/py.typed", *(str(path.relative_to(ROOT)) for path in templates)}
     assert names == sources | settings | others
 

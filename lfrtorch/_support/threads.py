@@ -93,6 +93,18 @@ def spread(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:
             other.result()
 
 
+def spread_loop(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:
+    """``spread`` of a kernel that loops: ``kernel(first, jobs, step, *arguments)``.
+
+    To call compiled code takes as long as it works on 50 samples.
+    """
+    threads = min(jobs, workers())
+    if threads <= 1:
+        kernel(0, jobs, 1, *arguments)
+    else:
+        spread(lambda first, *own: kernel(first, jobs, threads, *own), threads, *arguments)
+
+
 def worth_threads(samples: int, parameters: int = 70) -> bool:
     """Return whether fits of this size gain by threads of their own.
 
@@ -167,5 +179,5 @@ def to_numpy(tensor: Tensor) -> NDArray:
 
 
 def to_float64(tensor: Tensor) -> NDArray[np.float64]:
-    """A tensor of any device as an array of float64."""
-    return tensor.detach().cpu().double().numpy()
+    """A tensor of any device as a contiguous array of float64."""
+    return tensor.detach().cpu().double().contiguous().numpy()

@@ -16,15 +16,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.tables import percent
 from lfrtorch._support.types import Array, Booleans
-from lfrtorch.analysis.canonical_form import MOST_SAMPLES, canonical, nearest_affine
-from lfrtorch.engine.linearised import spectral_radius, static_slope
-from lfrtorch.engine.operating_point import double
+from lfrtorch.analysis.canonical_form import MOST_SAMPLES, Canonical, canonical, nearest_affine
 from lfrtorch.metrics import rms
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
@@ -101,26 +98,23 @@ def structure(model: Model, records: Record | Sequence[Record]) -> Structure:
         (True, 0.0)
     """
     form = canonical(model, records)
-    cell, scaler = double(form.model.lfr.cell), model.scaler
     bent, adds = form.bends >= _MINOR, form.shares >= _MINOR
-    assert cell.static is not None
-    A, _, Bw, Cz, _, Cy, _, Dyw = cell.matrices()
-    stable = float(spectral_radius(cell.A.detach())) < 1.0
+    A, _, Bw, Cz, _, Cy, _, Dyw = form.matrices
+    stable = float(np.abs(np.linalg.eigvals(A)).max()) < 1.0
     parts: list[tuple[Array, ...]] = []
     for record in as_records(records):
         z = model.signals(record).z[0, -MOST_SAMPLES:].double().numpy() @ form.Z.T
-        with torch.no_grad():
-            w = cell.static(torch.as_tensor(z)).numpy()
+        w = form.static(z)
         w = (w - w.mean(axis=0)) * adds
         x = _states(A, w @ Bw.T) if stable else np.zeros((len(w), len(A)))
-        u = scaler.normalise_u(record.u)[-MOST_SAMPLES:]
+        u = model.scaler.normalise_u(record.u)[-MOST_SAMPLES:]
         parts.append((u, z[:, bent], w[:, adds], x @ Cz[bent].T, x @ Cy.T + w @ Dyw.T))
     u, z, w, of_w, added = (np.concatenate(each) for each in zip(*parts, strict=True))
     spread = float(rms(z - z.mean(axis=0)))
     loop = float(rms(of_w)) / spread if stable else float("inf")
     before = _left(z, u)
     after = _left(added, w) if stable else 1.0
-    V, W, coupling = _branches(_slopes(form.model, z, bent)[:, adds], form.shares[adds])
+    V, W, coupling = _branches(_slopes(form, z, bent)[:, adds], form.shares[adds])
     whole_V, whole_W = np.zeros((len(V), len(bent))), np.zeros((len(adds), len(V)))
     whole_V[:, bent], whole_W[adds] = V, W
     name = _name(loop, before, after, coupling, len(V))
@@ -155,14 +149,13 @@ def _left(signal: Float[Array, "T n"], regressors: Float[Array, "T m"]) -> float
 
 
 def _slopes(
-    model: Model, z: Float[Array, "T n"], bent: Bool[Booleans, " nz"]
+    form: Canonical, z: Float[Array, "T n"], bent: Bool[Booleans, " nz"]
 ) -> Float[Array, "S nw n"]:
     """dw/dz of the canonical map at some samples, by the z that bend it."""
-    cell = model.lfr.cell
     points = np.zeros((len(z), len(bent)))
     points[:, bent] = z
     points = points[:: 1 + len(points) // 400]  # as many slopes tell the branches
-    return static_slope(cell, torch.as_tensor(points)[None])[0].numpy()[:, :, bent]
+    return form.slopes(points)[:, :, bent]
 
 
 def _branches(

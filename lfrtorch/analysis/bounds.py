@@ -19,25 +19,24 @@ References:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from torch.nn import Module
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import engineering, number, table
+from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import levels_of, vector
-from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import Beyond, Network, is_network
 from lfrtorch.engine.operating_point import double
-from lfrtorch.engine.simulation import folded
-from lfrtorch.engine.static_enclosure import Enclosure, Interval, enclosure, everywhere
+from lfrtorch.maps.activations import ACTIVATIONS, FAR
+from lfrtorch.maps.enclosure import Enclosure, Interval, everywhere
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
 
@@ -120,28 +119,10 @@ def bound(model: Model, amplitude: ArrayLike, *, x0: ArrayLike | None = None) ->
     start = (
         np.zeros(cell.nx) if x0 is None else vector("x0", x0, cell.nx, "the model has {} states")
     )
-    reached = reach(folded(cell), size / scaler.u_scale, start)
+    reached = reach(cell, size / scaler.u_scale, start)
     y = np.stack([scaler.restore_y(side) for side in reached.y], axis=-1)
-    signals = reached.x, *_unfolded(cell.static, reached.z, reached.w)
-    x, z, w = (np.stack(signal, axis=-1) for signal in signals)
+    x, z, w = (np.stack(signal, axis=-1) for signal in (reached.x, reached.z, reached.w))
     return Bound(size, y, x, z, w, model.inputs, model.outputs)
-
-
-def _unfolded(static: Module | None, z: Interval, w: Interval) -> tuple[Interval, Interval]:
-    """Bounds of z and w of a map from those of the f in it, see ``Beyond``."""
-    if not isinstance(static, Beyond):
-        return z, w
-    z, w = _unfolded(static.base, z, w)
-    L, Z, W = (M.double().cpu().numpy() for M in (static.slope, static.into, static.out))
-    less = _mapped(-W @ L, z)
-    w = _mapped(W, w)
-    return _mapped(np.linalg.inv(Z), z), Interval(w.low + less.low, w.high + less.high)
-
-
-def _mapped(M: Array, v: Interval) -> Interval:
-    """Bounds of M v."""
-    middle, radius = M @ v.middle, np.abs(M) @ v.radius
-    return Interval(middle - radius, middle + radius).wider()
 
 
 def amplitudes(given: ArrayLike, nu: int) -> Array:
@@ -168,38 +149,48 @@ class _Reach:
 
 def reach(cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]) -> _Reach:
     """Bounds of all signals for |u| <= amplitude, normalised; the cell is in float64 on the CPU."""
-    static = _bounded_map(cell)
-    loop = _Loop(cell, static, amplitude, x0)
+    anywhere = cell.map.enclosure(everywhere(cell.nz))
+    _check(cell, anywhere)
+    loop = _Loop(cell, anywhere, amplitude, x0)
     K = np.zeros((cell.nw, cell.nz))
-    if static is None:
+    if anywhere is None:
         nothing = Interval(np.empty(0), np.empty(0))
         return _Reach(*loop.signals(loop.bounds(K, nothing))[:3], nothing, None)
-    found = loop.bounds(K, enclosure(static, everywhere(cell.nz)).w)
+
+    def inside(rows: Interval, K: Array | None = None) -> Enclosure:
+        found = cell.map.enclosure(*loop.signals(rows)[2:], K)
+        assert found is not None
+        return found
+
+    found = loop.bounds(K, anywhere.w)
     closed = False
     for _ in range(50):
-        inside = enclosure(static, *loop.signals(found)[2:])
+        there = inside(found)
         if closed:
-            K = inside.J.middle
+            K = there.J.middle
             if not _is_stable(loop.closed(K)):
                 break
-            inside = enclosure(static, *loop.signals(found)[2:], K)
-        before, found = found, found.within(loop.bounds(K, inside.w))
+            there = inside(found, K)
+        before, found = found, found.within(loop.bounds(K, there.w))
         if (found.radius >= 0.99 * before.radius).all():  # a round shrinks none
             if closed:
                 break
             closed = True
-    x, y, z, a = loop.signals(found)
-    inside = enclosure(static, z, a)
-    return _Reach(x, y, z, inside.w, inside)
+    x, y, z, _ = loop.signals(found)
+    there = inside(found)
+    return _Reach(x, y, z, there.w, there)
 
 
 class _Loop:
-    """The linear part of a model with the rows that are bounded: x, y, z and, if nz > 1, Wz z."""
+    """The linear part of a model with the rows that are bounded.
+
+    These are x, y, z and, if nz > 1, the inputs of neurons.
+    """
 
     def __init__(
         self,
         cell: LFRCell,
-        static: Network | None,
+        anywhere: Enclosure | None,
         amplitude: Float[Array, " nu"],
         x0: Float[Array, " nx"],
     ) -> None:
@@ -207,8 +198,8 @@ class _Loop:
         self.A, self.Bu, self.Bw, self.Cz, self.Dzu = A, Bu, Bw, Cz, Dzu
         self._amplitude, self._x0 = amplitude, x0
         Wz = np.zeros((0, cell.nz))
-        if static is not None and cell.nz > 1:  # one z bounds its neurons itself
-            Wz = static.Wz.detach().numpy()
+        if anywhere is not None and anywhere.neurons and cell.nz > 1:  # one z bounds them itself
+            Wz = to_float64(anywhere.neurons[2])
         self.C = np.concatenate([np.eye(cell.nx), Cy, Cz, Wz @ Cz])
         self.Du = np.concatenate([np.zeros((cell.nx, cell.nu)), Dyu, Dzu, Wz @ Dzu])
         self.Dw = np.zeros((len(self.C), cell.nw))
@@ -216,7 +207,7 @@ class _Loop:
         self._ends = np.cumsum([cell.nx, cell.ny, cell.nz])
 
     def signals(self, rows: Interval) -> tuple[Interval, Interval, Interval, Interval | None]:
-        """Bounds of x, y, z and Wz z; None without the last."""
+        """Bounds of x, y, z and inputs of neurons; None without the last."""
         low, high = (np.split(side, self._ends) for side in rows)
         x, y, z, a = (Interval(*pair) for pair in zip(low, high, strict=True))
         return x, y, z, (a if len(a.low) else None)
@@ -307,20 +298,13 @@ def _is_stable(A: Float[Array, "nx nx"]) -> bool:
     return np.abs(np.linalg.eigvals(A)).max() < 1.0
 
 
-def _bounded_map(cell: LFRCell) -> Network | None:
-    """The static map; refuse a model whose bound would be infinite."""
-    static = cell.static
-    *names, last = (name for name, sigma in ACTIVATIONS.items() if sigma.bounded)
-    bounded = f"{', '.join(names)} or {last}"
-    if static is not None and not is_network(static):
+def _check(cell: LFRCell, anywhere: Enclosure | None) -> None:
+    """Refuse a model whose bound would be infinite."""
+    if cell.nw and (anywhere is None or not (anywhere.w.radius < math.sqrt(FAR)).all()):
+        *names, last = (name for name, sigma in ACTIVATIONS.items() if sigma.bounded)
         raise InputError(
-            f"the static map is a {type(static).__name__}, which is not known to be bounded; "
-            f"a proven bound needs a network of {bounded}."
-        )
-    if static is not None and not static.sigma.bounded:
-        raise InputError(
-            f"the static map is a network of {static.activation}, which is not bounded; a "
-            f"proven bound needs one of {bounded}."
+            f"the static map is a {cell.map.title}, which is not known to be bounded; a proven "
+            f"bound needs a network of {', '.join(names)} or {last}."
         )
     largest = float(np.abs(np.linalg.eigvals(cell.A.detach().numpy())).max())
     if largest >= 1.0:
@@ -328,4 +312,3 @@ def _bounded_map(cell: LFRCell) -> Network | None:
             f"A is not stable, |eigenvalue| {largest:.6g}: a small input may make the states grow "
             "without bound.\nA fit with trainer.guarantee=stable keeps the eigenvalues within 1."
         )
-    return static

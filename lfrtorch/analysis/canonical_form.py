@@ -24,10 +24,9 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.data_reach import whitening
-from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.cell import LFRCell, Matrices
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import static_slope
-from lfrtorch.engine.nonlinearity import Beyond
 from lfrtorch.engine.operating_point import double
 from lfrtorch.linear.resolvent import frequency_response
 from lfrtorch.model import Model
@@ -48,11 +47,17 @@ class Canonical:
     """A model in its canonical form, and what its coordinates mean.
 
     Args:
-        model: the same model; x = X x_before, z = Z z_before.
+        model: the same model in the canonical x = X x_before, with its static map f as it was.
+        matrices: the linear block in the canonical x, z and w.
+        slope: L, of the affine map nearest to f over the data.
+        X, Z, W: from the coordinates before to these; the map of the canonical z is
+            w = W (f(Z⁻¹ z) - L Z⁻¹ z), see ``static``.
         shares: part of the power that the nonlinearity adds to the normalised output, by w, if all
             w had the mean of their spectra; 0 if it adds nothing.
         bends: part of the mean squared change of the map's slope, by z; w counts by its share.
-        X, Z: from the coordinates before to these.
+
+    Shape:
+        slope: (nw, nz), X: (nx, nx), Z: (nz, nz), W: (nw, nw), shares: (nw,), bends: (nz,).
 
     Example:
         >>> _ = model.lfr.cell.static.Ww.data.normal_()
@@ -62,20 +67,35 @@ class Canonical:
     """
 
     model: Model
-    shares: Float[Array, " nw"]
-    bends: Float[Array, " nz"]
+    matrices: Matrices
+    slope: Float[Array, "nw nz"]
     X: Float[Array, "nx nx"]
     Z: Float[Array, "nz nz"]
+    W: Float[Array, "nw nw"]
+    shares: Float[Array, " nw"]
+    bends: Float[Array, " nz"]
+
+    @torch.no_grad()
+    def static(self, z: Float[Array, "S nz"]) -> Float[Array, "S nw"]:
+        """w of the canonical z: what the map is beyond a linear one."""
+        z = z @ _inverse(self.Z).T
+        w = double(self.model.lfr.cell).map(torch.as_tensor(z)).numpy()
+        return (w - z @ self.slope.T) @ self.W.T
+
+    def slopes(self, z: Float[Array, "S nz"]) -> Float[Array, "S nw nz"]:
+        """∂w/∂z of ``static``."""
+        back = _inverse(self.Z)
+        J = static_slope(double(self.model.lfr.cell), torch.as_tensor(z @ back.T)[None])[0].numpy()
+        return self.W @ (J - self.slope) @ back
 
 
 @typed()
 def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     """A model in its canonical form: the same for all weights that are the same model.
 
-    Its static map is what is left of the model's beyond the nearest affine map over the records,
-    a module of class ``Beyond`` that holds the map itself. It simulates as the model does, to
-    rounding and in the same compiled code. Where only u, x and y count, as in ``lfrtorch.export``,
-    the linear part goes back to the map: exported are the matrices of the model, with these x.
+    Its static map is what is left of the model's beyond the nearest affine map over the records:
+    that is in the matrices instead. The model itself comes back in these x, to simulate and to be
+    saved, with the linear part in its map still: between u, x and y that changes nothing.
 
     Args:
         model: nonlinear.
@@ -90,11 +110,12 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
 
     Example:
         >>> _ = model.lfr.cell.static.Ww.data.normal_()
-        >>> same = lfrtorch.analysis.canonical(model, record).model
-        >>> np.allclose(same.simulate(record), model.simulate(record))
+        >>> found = lfrtorch.analysis.canonical(model, record)
+        >>> np.allclose(found.model.simulate(record), model.simulate(record))
         True
-        >>> round(float(same.signals(record).z.var(correction=0)), 6)
-        1.0
+        >>> z = model.signals(record).z[0].numpy() @ found.Z.T
+        >>> round(float(z.var()), 6), round(float(found.static(z).var()), 6)
+        (1.0, 1.0)
     """
     cell = double(model.lfr.cell)
     if cell.static is None:
@@ -142,30 +163,28 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     largest = np.take_along_axis(seen, np.abs(seen).argmax(axis=0)[None], 0)
     X = np.where(largest < 0, -1.0, 1.0).T * X  # what nobody sees keeps its sign
     back, out = _inverse(X), _inverse(W)
-    made = {
-        "A": X @ A @ back, "Bu": X @ Bu, "Bw": X @ Bw @ out, "Cz": Z @ Cz @ back, "Dzu": Z @ Dzu,
-        "Cy": Cy @ back, "Dyu": Dyu, "Dyw": Dyw @ out,
-    }  # fmt: skip
+    matrices = Matrices(
+        A=X @ A @ back, Bu=X @ Bu, Bw=X @ Bw @ out, Cz=Z @ Cz @ back, Dzu=Z @ Dzu,
+        Cy=Cy @ back, Dyu=Dyu, Dyw=Dyw @ out,
+    )  # fmt: skip
     K = None if model.K is None else torch.as_tensor(X) @ model.K.double().cpu()
-    reach = model.reach and replace(model.reach, z=model.reach.z.turned(Z))
-    same = replace(model, lfr=LFR(_cell(cell, made, slope, _inverse(Z), W)), K=K, reach=reach)
-    P = X @ model.state_covariance @ X.T
-    same.lfr.cell.state_covariance.copy_(torch.as_tensor(P))
+    same = replace(model, lfr=LFR(_in_coordinates(cell, X)), K=K)
     shares, bends = (part / max(part.sum(), 1e-300) for part in (power, bends))
-    return Canonical(same, shares, bends, X, Z)
+    return Canonical(same, matrices, slope, X, Z, W, shares, bends)
 
 
-def _cell(cell: LFRCell, made: dict[str, Array], slope: Array, into: Array, out: Array) -> LFRCell:
-    """The cell with these matrices and the map beyond its linear part."""
-    parts = (torch.as_tensor(np.ascontiguousarray(part)) for part in (slope, into, out))
-    assert cell.static is not None
-    static = Beyond(deepcopy(cell.static), *parts)
-    found = LFRCell(
-        cell.nu, cell.ny, cell.nx, cell.nz, cell.nw, static, dtype=torch.float64, random=False
-    )
-    with torch.no_grad():
-        for name, value in made.items():
-            found.get_parameter(name).copy_(torch.as_tensor(np.ascontiguousarray(value)))
+@torch.no_grad()
+def _in_coordinates(cell: LFRCell, X: Float[Array, "nx nx"]) -> LFRCell:
+    """The cell with the states X x."""
+    sizes = cell.nu, cell.ny, cell.nx, cell.nz, cell.nw
+    found = LFRCell(*sizes, deepcopy(cell.static), dtype=torch.float64, random=False)
+    M, back = cell.matrices(), _inverse(X)
+    turned = {"A": X @ M.A @ back, "Bu": X @ M.Bu, "Bw": X @ M.Bw}
+    turned |= {"Cz": M.Cz @ back, "Cy": M.Cy @ back}
+    for name, value in {**M._asdict(), **turned}.items():
+        found.get_parameter(name).copy_(torch.as_tensor(value))
+    P = torch.as_tensor(X)
+    found.state_covariance.copy_(P @ cell.state_covariance @ P.mT)
     return found
 
 

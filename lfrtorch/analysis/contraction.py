@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,21 +18,10 @@ from lfrtorch._support.tables import factor_of, number
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.bounds import amplitudes, reach
 from lfrtorch.analysis.linearisation import levels_of
-from lfrtorch.data_reach import DataReach
-from lfrtorch.engine.activations import FAR
+from lfrtorch.data_reach import Cloud, DataReach
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import linearise, spectral_radius
-from lfrtorch.engine.nonlinearity import Network, is_network
 from lfrtorch.engine.operating_point import double
-from lfrtorch.engine.simulation import folded
-from lfrtorch.engine.static_enclosure import (
-    ROUNDING,
-    Enclosure,
-    Interval,
-    enclosure,
-    everywhere,
-    slopes_in,
-)
 from lfrtorch.least_squares.certificate import (
     SLOWEST,
     Certificate,
@@ -42,6 +30,8 @@ from lfrtorch.least_squares.certificate import (
     common_norm,
     gain,
 )
+from lfrtorch.maps.activations import FAR
+from lfrtorch.maps.enclosure import ROUNDING, Enclosure, Interval, everywhere
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record
 
@@ -183,12 +173,12 @@ def contraction(
         >>> lfrtorch.analysis.contraction(model, record).data_rate <= contraction.rate
         True
     """
-    cell = folded(double(model.lfr.cell))
-    static = cell.static
-    if static is not None and not is_network(static):
+    cell = double(model.lfr.cell)
+    anywhere = cell.map.enclosure(everywhere(cell.nz))
+    if cell.nw and anywhere is None:
         raise InputError(
-            f"the static map is a {type(static).__name__}, whose slopes are not known to be "
-            "bounded; a certificate needs a network, or no map."
+            f"the static map is a {cell.map.title}, whose slopes are not known to be bounded; a "
+            "certificate needs a network, or no map."
         )
     scale, channels = model.scaler.u_scale, (model.inputs, model.outputs)
     if records is not None:
@@ -207,7 +197,6 @@ def contraction(
         proof = _proof(cell, _slopes_within(cell, size / scale))
     else:
         size = np.full(cell.nu, np.inf)
-        anywhere = None if static is None else enclosure(static, everywhere(cell.nz))
         proof = _proof(cell, anywhere)
         if isinstance(proof, str):
             size, proof = _largest(cell, proof)
@@ -228,7 +217,7 @@ def contraction(
     # It takes more than twice as long to forget as the spectral radius allows.
     slow = np.isinf(size).all() and rate**2 > _radius(system)
     hint = ""
-    if slow and static is not None and math.isnan(data_rate):
+    if slow and cell.nw and math.isnan(data_rate):
         hint = (
             "For inputs of an amplitude the rate may be far smaller: "
             "contraction(model, amplitude=...)."
@@ -247,17 +236,16 @@ def _in_data(cell: LFRCell, reach: DataReach | None) -> _Norm | str:
     """The best norm for z in the box of the data, or why there is none."""
     # The mean slope between two z in the box is a mean of slopes in its cells, so that a norm which
     # shrinks in all cells shrinks between the two.
-    if not is_network(cell.static):
+    if not cell.nw:
         proof = _proof(cell, None)
         return proof if isinstance(proof, str) else _Norm(proof[1].P, _fastest(*proof)[0])
     if reach is None:
         return "the reach of the data is not known."
-    static, T = deepcopy(cell.static), reach.z.axes
-    with torch.no_grad():
-        static.bz.add_(static.Wz @ torch.as_tensor(reach.z.middle))
-        static.Wz.copy_(static.Wz @ torch.linalg.inv(torch.as_tensor(T)))
-    box = _Box(cell, static, T, Interval(*reach.z.ends.T))
-    J = slopes_in(static, box.grid()).middle
+    box = _Box(cell, reach.z)
+    slopes = box.slopes(box.grid())
+    if slopes is None:
+        return "the slopes of the static map in the region of the data are not known."
+    J = slopes.middle
     A = box.A(J)
     radii = np.abs(np.linalg.eigvals(A)).max(axis=1)
     steepest = float(radii.max())
@@ -296,33 +284,37 @@ def _norms(P: Float[Array, "nx nx"], A: Float[Array, "C nx nx"]) -> Float[Array,
 
 @dataclass(frozen=True, eq=False)
 class _Box:
-    """A box of T z, with the network of it."""
+    """The box of v = T (z - middle), T the axes of a cloud."""
 
     cell: LFRCell
-    static: Network
-    T: Float[Array, "nz nz"]
-    ends: Interval
+    z: Cloud
+
+    def slopes(self, cells: Interval) -> Interval | None:
+        """What ∂w/∂v cannot leave in cells of v."""
+        into = np.asarray(np.linalg.inv(self.z.axes), dtype=np.float64)
+        return self.cell.map.slopes_in(cells, into, self.z.middle)
 
     def grid(self) -> Interval:
         """Some cells of the box."""
-        cells = Interval(self.ends.low[None], self.ends.high[None])
+        cells = Interval(*self.z.ends.T[:, None])
         while 2 ** cells.low.shape[1] * len(cells.low) <= _FIRST_CELLS:
             cells = cells.parts()
         return cells
 
     def A(self, J: Float[Array, "C nw nz"]) -> Float[Array, "C nx nx"]:
-        """∂x+/∂x for slopes of the network."""
+        """∂x+/∂x for slopes ∂w/∂v."""
         M = self.cell.matrices()
-        return M.A + M.Bw @ J @ self.T @ M.Cz
+        return M.A + M.Bw @ J @ self.z.axes @ M.Cz
 
     def rate(self, P: Float[Array, "nx nx"]) -> float:
         """What the norm of P shrinks to, proven: cells are halved where that is not known well."""
         L = np.linalg.cholesky(P).T
         M = self.cell.matrices()
-        left, right = np.abs(L @ M.Bw), np.abs(self.T @ M.Cz @ np.linalg.inv(L))
+        left, right = np.abs(L @ M.Bw), np.abs(self.z.axes @ M.Cz @ np.linalg.inv(L))
         cells, proven, count = self.grid(), 0.0, 0
         while len(cells.low):
-            J = slopes_in(self.static, cells)
+            J = self.slopes(cells)
+            assert J is not None
             norms = _norms(P, self.A(J.middle))
             rates = norms + np.linalg.norm(left @ J.radius @ right, 2, axis=(1, 2)) + ROUNDING
             count += len(rates)

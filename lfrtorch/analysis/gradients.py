@@ -53,8 +53,7 @@ class Gradients:
             solve_initial_states=not fitted,
         )
         self.record, self.kept = record, kept
-        theta = errors.parameters.of(model.lfr.cell, errors.first_initial_states())
-        (self.trajectory,) = errors.trajectories(theta)
+        _, (self.trajectory,) = errors.evaluate(errors.first_theta())
         group: RecordGroup = errors.groups[0].counted(self.trajectory.y)
         self.group = group
         periodic, self.estimated = group.start == "periodic", group.start == "estimated"

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from torch.nn import Module
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import reals
@@ -25,9 +24,8 @@ from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import vector
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import static_slope
-from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network, known
 from lfrtorch.engine.operating_point import double, equilibrium
-from lfrtorch.engine.simulation import folded
+from lfrtorch.maps.mean_slopes import Neurons
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
@@ -181,8 +179,8 @@ def lpv(
             network with fewer of them than neurons is better off with them. Default: the neurons of
             a network, the map of others.
 
-    A map of the user's own class is integrated by a Gauss-Legendre rule with 32 nodes; what the
-    rule leaves goes along ζ, so that f(z0) + Δ ζ is exact.
+    A map that is no network and no polynomial is integrated by a Gauss-Legendre rule with 32 nodes;
+    what the rule leaves goes along ζ, so that f(z0) + Δ ζ is exact.
 
     Shape:
         u: (nu,) or a number for one input, x: (nx,).
@@ -198,15 +196,15 @@ def lpv(
         >>> form.A.shape, bool(np.isfinite(form.bounds).all())
         ((2, 1, 1), True)
     """
-    cell, s = folded(double(model.lfr.cell)), model.scaler
-    network = cell.static if is_network(cell.static) else None
+    cell, s = double(model.lfr.cell), model.scaler
+    neurons = cell.map.neurons
     if schedule not in (None, "neurons", "map"):
         raise InputError(f"schedule is {schedule!r}; give 'neurons' or 'map'.")
-    if schedule == "neurons" and network is None:
+    if schedule == "neurons" and neurons is None:
         raise InputError(
             "schedule is 'neurons', and the static map is no network; give schedule='map'."
         )
-    schedule = schedule or ("map" if network is None else "neurons")
+    schedule = schedule or ("map" if neurons is None else "neurons")
     u0 = s.u_offset if u is None else vector("u", u, cell.nu, "the model has {} input(s)")
     v0 = torch.as_tensor((u0 - s.u_offset) / s.u_scale)
     if x is not None:
@@ -216,7 +214,7 @@ def lpv(
     with torch.no_grad():
         y0, x_next0 = (each.numpy() for each in cell(v0, x0))
         z0 = cell.internal(v0, x0)[0].numpy()
-    left, right, bounds, slopes = _slopes(cell, network, z0, schedule)
+    left, right, bounds, slopes = _slopes(cell, z0, neurons if schedule == "neurons" else None)
     A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
 
     def affine(M: Array, into: Array, of: Array) -> Array:
@@ -236,47 +234,28 @@ def lpv(
 
 
 def _slopes(
-    cell: LFRCell, network: Network | None, z0: Float[Array, " nz"], schedule: str
+    cell: LFRCell, z0: Float[Array, " nz"], neurons: Neurons | None
 ) -> tuple[Array, Array, Float[Array, "P 2"], Slopes]:
-    """L (nw, P), R (P, nz), bounds and p(ζ) of Δ = L diag(p) R."""
-    nw, nz = cell.nw, cell.nz
-    if cell.static is None:
-        return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 2)), lambda zeta: zeta
-    if network is not None and schedule == "neurons":
-        Wz, Ww = _matrices(network)
-        bounds = np.tile(network.sigma.slope_bounds, (len(Wz), 1))
-        return Ww, Wz, bounds, lambda zeta: _mean_slopes(network, z0, zeta)
+    """L (nw, P), R (P, nz), bounds and p(ζ) of Δ = L diag(p) R; its entries without neurons."""
+    if neurons is not None:
+        return *neurons[:3], lambda zeta: neurons.mean_slopes(z0, zeta)
+    nw, nz, found = cell.nw, cell.nz, cell.map.neurons
     left, right = np.repeat(np.eye(nw), nz, axis=1), np.tile(np.eye(nz), (nw, 1))
-    found = np.array([-np.inf, np.inf]) if network is None else _bounds(network)
-    bounds = np.broadcast_to(found, (nw, nz, 2)).reshape(-1, 2)
-    return left, right, bounds, lambda zeta: _delta(cell, network, z0, zeta).reshape(len(zeta), -1)
+    bounds = np.array([-np.inf, np.inf]) if found is None else found.delta_bounds
+    bounds = np.broadcast_to(bounds, (nw, nz, 2)).reshape(nw * nz, 2)
+    return left, right, bounds, lambda zeta: _delta(cell, z0, zeta).reshape(len(zeta), nw * nz)
 
 
 def _delta(
-    cell: LFRCell,
-    network: Network | None,
-    z0: Float[Array, " nz"],
-    zeta: Float[Array, "S nz"],
+    cell: LFRCell, z0: Float[Array, " nz"], zeta: Float[Array, "S nz"]
 ) -> Float[Array, "S nw nz"]:
     """Δ(ζ)."""
-    if network is not None:
-        Wz, Ww = _matrices(network)
-        return Ww @ (_mean_slopes(network, z0, zeta)[..., None] * Wz)
-    t, weight = gauss_legendre(cell.static)
-    points = z0 + t[:, None, None] * zeta
-    delta = np.tensordot(weight, static_slope(cell, torch.as_tensor(points)).numpy(), 1)
-    return delta if known(cell.static) else delta + _left_over(cell, z0, zeta, delta)
-
-
-def gauss_legendre(static: Module | None) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Nodes and weights of a rule for integrals of a map's slope from 0 to 1.
-
-    The slope of a polynomial is one in t, for which few nodes are exact.
-    """
-    found = known(static)
-    nodes = (found.degree + 1) // 2 if isinstance(found, Polynomial) else 32
-    t, weight = np.polynomial.legendre.leggauss(nodes)
-    return (t + 1.0) / 2, weight / 2
+    if (neurons := cell.map.neurons) is not None:
+        return neurons.delta(z0, zeta)
+    t, weight, exact = cell.map.quadrature
+    points = torch.as_tensor(z0 + t[:, None, None] * zeta)
+    delta = np.tensordot(weight, static_slope(cell, points).numpy(), 1)
+    return delta if exact else delta + _left_over(cell, z0, zeta, delta)
 
 
 @torch.no_grad()
@@ -287,8 +266,7 @@ def _left_over(
     delta: Float[Array, "S nw nz"],
 ) -> Float[Array, "S nw nz"]:
     """Least change of Δ that makes f(z0) + Δ ζ exact."""
-    assert cell.static is not None
-    f = cell.static(torch.as_tensor(np.concatenate([z0[None], z0 + zeta]))).numpy()
+    f = cell.map(torch.as_tensor(np.concatenate([z0[None], z0 + zeta]))).numpy()
     error = f[1:] - f[0] - np.einsum("swz,sz->sw", delta, zeta)
     error[np.abs(error) <= _ROUNDING * (np.abs(f[1:]) + np.abs(f[0]))] = 0.0
     power = np.sum(zeta**2, axis=1, keepdims=True)
@@ -296,26 +274,4 @@ def _left_over(
     return error[:, :, None] * along[:, None, :]
 
 
-def _matrices(static: Network) -> tuple[Array, Array]:
-    """Wz and Ww."""
-    return static.Wz.detach().numpy(), static.Ww.detach().numpy()
-
-
-def _mean_slopes(
-    static: Network, z0: Float[Array, " nz"], zeta: Float[Array, "S nz"]
-) -> Float[Array, "S nn"]:
-    """The mean slopes of the neurons between z0 and z0 + ζ."""
-    Wz, _ = _matrices(static)
-    return static.sigma.mean_slope(Wz @ z0 + static.bz.detach().numpy(), zeta @ Wz.T)
-
-
-def _bounds(static: Network) -> Float[Array, "nw nz 2"]:
-    """Bounds of the entries of Δ, by interval arithmetic."""
-    Wz, Ww = _matrices(static)
-    corners = [slope * Wz for slope in static.sigma.slope_bounds]
-    low, high = np.minimum(*corners), np.maximum(*corners)
-    plus, minus = np.maximum(Ww, 0.0), np.minimum(Ww, 0.0)
-    return np.stack([plus @ low + minus @ high, plus @ high + minus @ low], axis=-1)
-
-
-__all__ = ["LPV", "gauss_legendre", "lpv"]
+__all__ = ["LPV", "lpv"]

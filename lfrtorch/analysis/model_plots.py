@@ -26,11 +26,10 @@ from lfrtorch._support.tables import percent
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.canonical_form import nearest_affine, whitening
 from lfrtorch.analysis.linearisation import linear_part, linearise
-from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.linearised import static_slope
-from lfrtorch.engine.nonlinearity import known_parts
 from lfrtorch.engine.operating_point import double
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.maps.linearised import linearise_map
+from lfrtorch.maps.static_map import StaticMap
 from lfrtorch.metrics import rms
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
@@ -64,9 +63,9 @@ def model_figure(model: Model, records: Record | Sequence[Record] | None = None)
     systems = {"linear part": linear_part(model)}
     with suppress(InputError):  # it may have no rest at the offsets
         systems["at rest"] = linearise(model)
-    cell = _learned(double(model.lfr.cell))
-    pairs = [(i, j) for i in range(cell.ny) for j in range(cell.nu)][:4]
-    maps = min(cell.nw, _MOST_MAPS)
+    static = _drawn(model)
+    pairs = [(i, j) for i in range(len(model.outputs)) for j in range(len(model.inputs))][:4]
+    maps = min(static.nw, _MOST_MAPS)
     height = max(_LEAST_HEIGHT, _HEIGHT * max(len(pairs), -(-maps // 2)))
     widths = [4.5, 3.5, *([4.0 if maps == 1 else 6.5] if maps else [])]
     figure = Figure(figsize=(sum(widths), height), layout="constrained")
@@ -76,47 +75,43 @@ def model_figure(model: Model, records: Record | Sequence[Record] | None = None)
     _responses(parts[0], systems, pairs)
     _poles(parts[1], systems)
     if maps:
-        _maps(parts[2], cell, visited(model, cell, records), maps)
+        _maps(parts[2], static, visited(model, static, records), maps)
     return figure
 
 
 def static_figure(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:
     """The last part of that figure alone: the nonlinearity of the static map."""
-    cell = _learned(double(model.lfr.cell))
-    if not cell.nw:
+    static = _drawn(model)
+    if not static.nw:
         raise InputError("the model is linear and has no static map to draw.")
-    maps = min(cell.nw, _MOST_MAPS)
+    maps = min(static.nw, _MOST_MAPS)
     size = (5.0 if maps == 1 else 7.5), max(_LEAST_HEIGHT, _HEIGHT * -(-maps // 2))
     figure = Figure(figsize=size, layout="constrained")
-    _maps(figure, cell, visited(model, cell, records), maps)
+    _maps(figure, static, visited(model, static, records), maps)
     return figure
 
 
-def _learned(cell: LFRCell) -> LFRCell:
-    """A cell with the map that is learned beside a known model alone; any other as it is."""
-    parts = known_parts(cell.static)
-    if parts is None or parts[1] is None:
-        return cell
-    own, learned = parts
-    sizes = cell.nu, cell.ny, cell.nx, cell.nz - own.nz, cell.nw - own.nw
-    return LFRCell(*sizes, learned, dtype=torch.float64, random=False)
+def _drawn(model: Model) -> StaticMap:
+    """The map that is learned, beside a known model or alone; or a known model."""
+    static = double(model.lfr.cell).map
+    return static.learned if static.learned.nw else static
 
 
-def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | None) -> _Visited:
+def visited(model: Model, static: StaticMap, records: Record | Sequence[Record] | None) -> _Visited:
     """Inputs of the static map along simulations, and its nearest affine map there."""
     if records is None:
-        noise = np.random.default_rng(0).standard_normal((4000, cell.nu))
+        noise = np.random.default_rng(0).standard_normal((4000, len(model.inputs)))
         signals = [model.scaler.u_offset + model.scaler.u_scale * noise]
     else:
         signals = as_records(records)
     z = np.concatenate([model.signals(one).z[0].double().numpy() for one in signals])
-    z = z[:: 1 + len(z) // 20_000, z.shape[1] - cell.nz :]  # of what is learned, the last
+    z = z[:: 1 + len(z) // 20_000, z.shape[1] - static.nz :]  # of what is learned, the last
     if not np.isfinite(z).all():
         raise InputError(
             "the model diverges on the records; give others." if records is not None else
             "the model diverges under white noise of the training inputs' rms; give records."
         )  # fmt: skip
-    w = _static(cell, z)
+    w = _w(static, z)
     slope, offset = nearest_affine(z, w)
     deviation = np.std(w, axis=0)
     left = rms(w - z @ slope.T - offset, axis=0) / np.where(deviation > 0, deviation, 1.0)
@@ -124,9 +119,8 @@ def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | No
 
 
 @torch.no_grad()
-def _static(cell: LFRCell, z: Float[Array, "S nz"]) -> Float[Array, "S nw"]:
-    assert cell.static is not None
-    return cell.static(torch.as_tensor(z)).numpy()
+def _w(static: StaticMap, z: Float[Array, "S nz"]) -> Float[Array, "S nw"]:
+    return static(torch.as_tensor(z)).numpy()
 
 
 def _responses(
@@ -165,7 +159,7 @@ def _poles(part: SubFigure, systems: Mapping[str, LinearModel]) -> None:
     ax.set_title("poles in the z plane", fontsize="medium")
 
 
-def _maps(part: Figure | SubFigure, cell: LFRCell, where: _Visited, count: int) -> None:
+def _maps(part: Figure | SubFigure, static: StaticMap, where: _Visited, count: int) -> None:
     """What the static map is beyond an affine one, a panel for each w."""
     z, nz = where.z, where.z.shape[1]
     low, high = z.min(axis=0), z.max(axis=0)
@@ -175,7 +169,7 @@ def _maps(part: Figure | SubFigure, cell: LFRCell, where: _Visited, count: int) 
         ax.set_axis_off()
 
     def beyond(points: Float[Array, "S nz"]) -> Float[Array, "S nw"]:
-        return _static(cell, points) - points @ where.slope.T - where.offset
+        return _w(static, points) - points @ where.slope.T - where.offset
 
     sides = [np.linspace(a, b, _GRID) for a, b in zip(low, high, strict=True)]
     for j, ax in enumerate(axes[:count]):
@@ -200,7 +194,7 @@ def _maps(part: Figure | SubFigure, cell: LFRCell, where: _Visited, count: int) 
             ax.plot(z[:, 0], z[:, 1], ",", color=OUTPUT, alpha=0.3)
             ax.set(xlabel="z1", ylabel="z2", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         else:
-            at, share = most_nonlinear(cell, where, j)
+            at, share = most_nonlinear(static, where, j)
             ax.plot(at, beyond(z)[:, j], ".", ms=1.0, color=NL_LFR, rasterized=True)
             ax.axhline(0, lw=0.5, color="0.8", zorder=0)
             ax.set_xlabel(f"direction of z with {percent(share)} of it")
@@ -209,14 +203,15 @@ def _maps(part: Figure | SubFigure, cell: LFRCell, where: _Visited, count: int) 
     part.suptitle(f"static map less its linear part, {where_from}", fontsize="medium")
 
 
-def most_nonlinear(cell: LFRCell, where: _Visited, j: int) -> tuple[Float[Array, " S"], float]:
+def most_nonlinear(static: StaticMap, where: _Visited, j: int) -> tuple[Float[Array, " S"], float]:
     """Where z is along the direction in which output j of the map changes its slope most, its part.
 
     It is the leading eigenvector of the mean of g gᵀ, g the slope less its mean, where z has unit
     covariance (Constantine, "Active Subspaces", SIAM, 2015).
     """
     T = whitening(where.z)
-    J = static_slope(cell, torch.as_tensor(where.z)[None])[0, :, j].numpy()
+    z, phi = torch.as_tensor(where.z)[None], static.flat_weights().detach()
+    J = linearise_map(static, z, phi, static.code).J[0, :, j].numpy()
     g = (J - J.mean(axis=0)) @ np.linalg.inv(T)
     shares, directions = np.linalg.eigh(g.T @ g / len(g))
     total = float(shares.sum())

@@ -14,7 +14,6 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import Cell, in_lines, number, table
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.confidence_bands import NOT_AT_MINIMUM, uncertainty
-from lfrtorch.engine.nonlinearity import known_parts
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
@@ -108,13 +107,12 @@ def physical_parameters(
         parameter      value    standard error  unit
         ...
     """
-    parts = known_parts(model.lfr.cell.static)
-    if parts is None:
+    known, learned = model.lfr.cell.map.known, model.lfr.cell.map.learned
+    if known is None:
         raise InputError(
             "the model has no known part, so no physical parameters; give Settings(known=...)."
         )
-    known, learned = parts
-    names, units = known.equations.parameters, known.equations.units
+    names, units = known.physics.parameters, known.physics.units
     scale = known.p_scale.detach().double().cpu().numpy()
     values = np.array([*known.physical.values()])
     n = len(names)
@@ -143,7 +141,7 @@ def physical_parameters(
         safe = np.where(errors > 0, errors, 1.0)[:, None]
         correlation = (root / safe) @ (root / safe).T
         alone = scale * np.linalg.norm(np.linalg.pinv(knows[:, is_own]), axis=1)
-        notes += _notes(names, errors, correlation, alone, learned=learned is not None)
+        notes += _notes(names, errors, correlation, alone, learned=learned.nw > 0)
         notes += doubts
     low, high = known.bounds.detach().double().cpu().numpy().T
     at = np.minimum(np.abs(values - low), np.abs(values - high)) <= _AT_BOUND * scale

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from lfrtorch._support.tables import number
-from lfrtorch.engine.nonlinearity import known_parts, linearise_static, of_static
+from lfrtorch.maps.linearised import linearise_map
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -16,19 +16,18 @@ from lfrtorch.records import Record
 def infinite_slope(model: Model, records: Sequence[Record]) -> str:
     """The first slope of the static map that is not finite along the records; "" if all are."""
     cell = model.lfr.cell
-    weights = of_static(dict(cell.named_parameters()))
+    static, phi = cell.map, cell.weights().phi
     for record in records:
         signals = model.signals(record)
-        slopes = linearise_static(cell.static, signals.z, weights)
-        every = torch.cat([slopes.J, slopes.by_weight()], -1)[0]
+        at = linearise_map(static, signals.z, phi, static.code)
+        every = torch.cat([at.J, at.by_weight()], -1)[0]
         if not signals.w.isfinite().all() or every.isfinite().all():
             continue
         k, i, j = (~every.isfinite()).nonzero()[0].tolist()
         of, by, at = f"w{i + 1}", f"z{j + 1}", signals.z[0, k]
         value = "" if j >= cell.nz else number(float(at[j]))
-        if (parts := known_parts(cell.static)) is not None and i < parts[0].nw:
-            known = parts[0]
-            states, inputs = known.equations.states, [u.name for u in model.inputs]
+        if (known := static.known) is not None and i < known.nw:
+            states, inputs = known.physics.states, [u.name for u in model.inputs]
             of = [*(f"the next {name}" for name in states), *(y.name for y in model.outputs)][i]
             if j < known.nz:
                 by = [*states, *inputs][j]

@@ -37,7 +37,6 @@ from lfrtorch.cli.run_folder import (
     SNAPSHOTS,
     STARTS,
     USED,
-    WORLD,
     arguments,
     chosen_before,
     common,
@@ -45,6 +44,7 @@ from lfrtorch.cli.run_folder import (
     no_empty_folder,
     program,
     resumable,
+    world,
 )
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import ProcessLostError, Ranks, connect
@@ -188,12 +188,12 @@ def launched(cfg: DictConfig, folder: Path, command: str) -> float:
 
 def launch() -> None:
     """``main``; of several processes the first alone has Hydra write files."""
-    if WORLD > 1 and study.is_study(sys.argv):
+    if world() > 1 and study.is_study(sys.argv):
         sys.exit("error: torchrun shares one fit; start several runs one after another.")
     with user_errors(os.environ.get("RANK", "0")):
         several = study.is_study(sys.argv)
         take_words("config", study.study_words if several else arguments)
-    if WORLD > 1 and os.environ["RANK"] != "0":
+    if world() > 1 and os.environ["RANK"] != "0":
         # Settings of Hydra for all processes but the first.
         sys.argv += ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none"]
     if several:

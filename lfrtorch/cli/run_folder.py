@@ -20,9 +20,6 @@ from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.paths import expanded
 from lfrtorch.distributed import Ranks
 
-WORLD = int(os.environ.get("WORLD_SIZE", "1"))
-"""Processes of one fit that torchrun started."""
-
 CONFIG, SNAPSHOTS, STARTS = "config.yaml", "resume", "starts"
 """In the folder of a run: its settings, its starts as far as they came, and events of those that go
 to the end."""
@@ -32,6 +29,11 @@ USED = "used"
 
 OVERRIDES = Path(".hydra", "overrides.yaml")
 """There, too: the words of its command line."""
+
+
+def world() -> int:
+    """Number of processes of one fit that torchrun started."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def arguments(given: Sequence[str]) -> list[str]:
@@ -103,8 +105,8 @@ def chosen_before(cfg: DictConfig, folder: Path) -> DictConfig:
 def program(script: str) -> list[str]:
     """The words that started this command: ``lfrtorch NAME``, or Python and the script."""
     installed = sys.argv[0].startswith("lfrtorch ")
-    if WORLD > 1:
-        several = ["torchrun", "--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", str(WORLD))]
+    if world() > 1:
+        several = ["torchrun", "--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", str(world()))]
         named = ["-m", "lfrtorch.cli", *sys.argv[0].split()[1:]] if installed else [script]
         return [*several, *named]
     return sys.argv[0].split() if installed else ["python", script]

@@ -18,8 +18,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lfrtorch.engine.jacobian_kernel import copy_to, network_by_weight
+from lfrtorch.engine.jacobian_kernel import copy_to, signals
 from lfrtorch.engine.linear_recurrence import NOTHING
+from lfrtorch.engine.simulation_kernel import matrices
+from lfrtorch.maps.machine_code import call_slope, prepared
 
 SAMPLES = 12
 """Samples in a block: 8 to 16 are as fast for 12 to 28 states; the responses then fit in cache."""
@@ -31,19 +33,33 @@ _TOGETHER = 32
 """Least columns of a product, but for the last one."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def blocked_rows(
-    job, A, Bw, Cz, Cy, Dyw, J, v, by_weight, slope, h, Ww, z, x_entries, z_entries, y_entries,
-    first, chunks, S, rows,
+    first, jobs, step, sizes, weights, code, u, x, z, w, r0, t0,
+    x_entries, z_entries, y_entries, static, chunks, S, rows,
+):  # fmt: skip
+    """``_rows`` of every job first, first + step, ... below ``jobs``."""
+    for job in range(first, jobs, step):
+        _rows(
+            job, sizes, weights, code, u, x, z, w, r0, t0, x_entries, z_entries, y_entries, static,
+            chunks, S, rows,
+        )  # fmt: skip
+
+
+@njit(nogil=True, error_model="numpy", fastmath={"contract"})
+def _rows(
+    job, sizes, weights, code, u, x, z, w, r0, t_first,
+    x_entries, z_entries, y_entries, static, chunks, S, rows,
 ):  # fmt: skip
     """What ``jacobian_rows`` writes, from the same arguments.
 
     BLAS rounds by the sizes of a product, so these are the same for any number of jobs.
     """
+    A, _, Bw, Cz, _, Cy, _, Dyw, phi = matrices(sizes, weights)
     r, chunk = job // chunks, job % chunks
-    J, v, by_weight, rows, S = J[r], v[r], by_weight[r], rows[r], S[r]
-    slope, h, z = slope[r], h[r], z[r]
-    (nx, nw), nn, (T, ny) = Bw.shape, h.shape[1], rows.shape[:2]
+    u, x, z, w, rows, S = u[r0 + r], x[r0 + r], z[r0 + r], w[r0 + r], rows[r], S[r]
+    slope, ints, constants, work = code[2], code[3], code[4], prepared(code, phi)
+    (nx, nw), nz, (T, ny) = Bw.shape, len(Cz), rows.shape[:2]
     n_x, n_z, n_y, C = len(x_entries), len(z_entries), len(y_entries), S.shape[1]
     # The columns are those of x, z, y, the static map and the initial state, in this order.
     column, start, edges = _sorted(x_entries, n_z, n_y, C, nx)
@@ -66,7 +82,9 @@ def blocked_rows(
     Sx, direct = np.zeros((n_own, nx), rows.dtype), np.zeros((n_own, SAMPLES), rows.dtype)
     Sw = np.zeros((len(own) - n_own, len(QW)), rows.dtype)
     by, of_direct = np.empty((len(own), wide), rows.dtype), np.empty((n_own, wide), rows.dtype)
-    d_w = np.zeros((nw, len(column) - n_x), rows.dtype)
+    d_w = np.zeros((nw, len(column) - n_x))
+    J, by_weight = np.zeros((SAMPLES, nw, nz)), np.zeros((nw, len(phi)))
+    v = np.empty((SAMPLES, nx + u.shape[1] + nw))
     for i in range(nx):
         for n in range(n_own):
             Sx[n, i] = S[i, own[n]]
@@ -77,25 +95,22 @@ def blocked_rows(
         count = min(SAMPLES, T - t0)
         if count < SAMPLES:
             P[:], QW[:] = 0.0, 0.0
-        _responses(AT, Cz, CyT, DywT, J[t0 : t0 + count], M, room, P, QW)
-        for n in range(n_own):
-            entry = x_entries[own[n], 2]
-            for b in range(count):
-                direct[n, b] = v[t0 + b, entry]
-        if len(Sw) > 0:
-            for b in range(count):
-                k = t0 + b
-                for q in range(nw):
-                    row = d_w[q]
-                    for n in range(n_z):
-                        row[n] = J[k, q, z_entries[n, 1]] * v[k, z_entries[n, 2]]
-                    if nn > 0:
-                        network_by_weight(Ww, slope, h, z, k, q, row, n_z)
-                    else:
-                        for n in range(by_weight.shape[2]):
-                            row[n_z + n] = by_weight[k, q, n]
-                    for n in range(len(Sw)):
-                        Sw[n, nx + q * SAMPLES + b] = row[w0 + n]
+        for b in range(count):
+            t = t_first + t0 + b
+            signals(x, u, w, t, v[b])
+            if nw:
+                call_slope(slope, ints, constants, phi, z[t], J[b], by_weight, len(phi), work)
+            for q in range(nw if len(Sw) > 0 else 0):
+                row = d_w[q]
+                for n in range(n_z):
+                    row[n] = J[b, q, z_entries[n, 1]] * v[b, z_entries[n, 2]]
+                for n in range(len(static)):
+                    row[n_z + n] = by_weight[q, static[n]]
+                for n in range(len(Sw)):
+                    Sw[n, nx + q * SAMPLES + b] = row[w0 + n]
+            for n in range(n_own):
+                direct[n, b] = v[b, x_entries[own[n], 2]]
+        _responses(AT, Cz, CyT, DywT, J[:count], M, room, P, QW)
         for k in range(k0, k1):
             n0, n1 = edges[k] - c0, edges[k + 1] - c0
             if n1 <= n_own:
@@ -117,9 +132,9 @@ def blocked_rows(
                     out[own[n]] = by[n, t]
         if chunk == 0:
             rows[t0 : t0 + count, :, n_x + n_z : n_x + n_z + n_y] = 0.0
-            for k in range(t0, t0 + count):
+            for b in range(count):
                 for n in range(n_y):
-                    rows[k, y_entries[n, 1], y_entries[n, 0]] = v[k, y_entries[n, 2]]
+                    rows[t0 + b, y_entries[n, 1], y_entries[n, 0]] = v[b, y_entries[n, 2]]
         _without_dust(by[:n_own], Sx, nx)
         _without_dust(by[n_own:], Sw, nx)
 

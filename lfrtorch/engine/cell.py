@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -13,6 +14,8 @@ from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
+from lfrtorch.engine.weights import Layout, Weights
+from lfrtorch.maps.static_map import StaticMap, as_map
 
 
 def check_dtype(dtype: torch.dtype) -> None:
@@ -183,6 +186,20 @@ class LFRCell(nn.Module):
         """Input z and output w of the static nonlinearity."""
         z = x @ self.Cz.mT + u @ self.Dzu.mT
         return z, (z if self.static is None else self.static(z))
+
+    @property
+    def map(self) -> StaticMap:
+        """The static map, which answers what the package asks of one."""
+        return as_map(self.static, self.nz, self.nw)
+
+    def weights(self, given: Sequence[Tensor] | None = None) -> Weights:
+        """All numbers of the cell as they are now, or those of its parameters as given."""
+        named = list(self.named_parameters())
+        parameters = [(name, p.numel(), p.requires_grad) for name, p in named]
+        sizes = self.nx, self.nu, self.ny, self.nz, self.nw
+        layout = Layout(sizes, self.map, parameters, self.state_covariance)
+        numbers = [p for _, p in named] if given is None else given
+        return Weights(layout, torch.cat([p.detach().flatten() for p in numbers]))
 
     def matrices(self) -> Matrices:
         """The linear block as arrays."""

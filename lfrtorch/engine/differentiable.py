@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any, NoReturn
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd import Function
 
 from lfrtorch._support.errors import LfrtorchError
@@ -22,18 +22,6 @@ _TWICE = (
     "an LFR has first derivatives only; for second ones step its cell in a loop: "
     "y, x = lfr.cell(u[:, k], x)."
 )
-
-
-class _Simulated(nn.Module):
-    """A cell as a module over time, for ``functional_call`` with other weights."""
-
-    def __init__(self, cell: LFRCell) -> None:
-        super().__init__()
-        self.cell = cell
-
-    def forward(self, u: Tensor, x0: Tensor, periodic: bool) -> Trajectory:
-        self.cell.check()
-        return steady_state(self.cell, u, x0) if periodic else simulate(self.cell, u, x0)
 
 
 Batch = tuple[tuple[Tensor, ...], tuple[int, ...]]
@@ -90,7 +78,7 @@ class _Adjoint(_Once):
         w: Tensor, *weights: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         signals = Trajectory(x, z, w, e)  # y does not matter
-        about = Linearisation(cell, u, signals, periodic=periodic, weights=weights)
+        about = Linearisation(cell.weights(weights), u, signals, periodic=periodic, every=True)
         with torch.autocast(u.device.type, enabled=False):
             found = about.adjoint(e, end)
         return found.u, found.x0, found.theta
@@ -111,7 +99,7 @@ class _Tangent(_Once):
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         changes, weights = both[: len(both) // 2], both[len(both) // 2 :]
         signals = Trajectory(x, z, w, u)  # y does not matter
-        about = Linearisation(cell, u, signals, periodic=periodic, weights=weights)
+        about = Linearisation(cell.weights(weights), u, signals, periodic=periodic, every=True)
         d_theta = torch.cat([change.flatten() for change in changes])
         return about.tangent_with_end(d_theta, None if periodic else d_x0, d_u)
 
@@ -129,13 +117,9 @@ class Simulation(Function):
         cell: LFRCell, periodic: bool, u: Tensor, x0: Tensor, *weights: Tensor
     ) -> tuple[Tensor, ...]:
         """Simulate with the weights, whatever the cell holds."""
-        simulated = _Simulated(cell)
-        if all(a is b for a, b in zip(cell.parameters(), weights, strict=True)):
-            found = simulated(u, x0, periodic)
-        else:  # under a transform of torch.func the cell holds weights that have no numbers
-            names = (f"cell.{name}" for name, _ in cell.named_parameters())
-            own = dict(zip(names, weights, strict=True))
-            found = torch.func.functional_call(simulated, own, (u, x0, periodic))
+        cell.check()
+        W = cell.weights(weights)
+        found = steady_state(W, u, x0) if periodic else simulate(W, u, x0)
         return found.y, found.x[:, -1].clone(), found.x, found.z, found.w
 
     @staticmethod

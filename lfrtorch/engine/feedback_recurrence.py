@@ -13,16 +13,17 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lfrtorch._support.threads import has_kernels, spread, to_numpy
+from lfrtorch._support.threads import has_kernels, spread, spread_loop, to_numpy
 from lfrtorch.engine.blocked_kernel import add_feedback
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.jacobian_kernel import copy_to
 from lfrtorch.engine.linear_recurrence import flush, linear_recurrence, scan
-from lfrtorch.engine.linearised import PASS, Weights, linearise_at, static_slope
+from lfrtorch.engine.linearised import PASS, linearise_at, static_slope
+from lfrtorch.engine.weights import Weights
 
 
 def states(
-    weights: Weights,
+    W: Weights,
     J: Float[Tensor, "R T nw nz"],
     g: Float[Tensor, "R T nx"],
     known: Float[Tensor, "R nx"],
@@ -37,42 +38,48 @@ def states(
         s = g.new_empty(len(g), g.shape[1] + 1, g.shape[2])
         s[:, -1 if backwards else 0] = known
         kernel = _backwards if backwards else _forwards
-        spread(kernel, len(g), *_matrices(weights), to_numpy(J), to_numpy(g), s.numpy())
+        spread_loop(kernel, len(g), *_matrices(W), to_numpy(J), to_numpy(g), s.numpy())
         return s
-    F, g, known = linearise_at(weights, J).F, g.unsqueeze(-1), known.unsqueeze(-1)
+    F, g, known = linearise_at(W, J).F, g.unsqueeze(-1), known.unsqueeze(-1)
     if backwards:
         return scan(F.mT.flip(1), g.flip(1), known).squeeze(-1).flip(1)
     return scan(F, g, known).squeeze(-1)
 
 
 def transition(
-    weights: Weights, J: Float[Tensor, "R T nw nz"], Phi: Float[Tensor, "R nx m"]
+    W: Weights, J: Float[Tensor, "R T nw nz"], Phi: Float[Tensor, "R nx m"]
 ) -> Float[Tensor, "R nx m"]:
     """F(T-1) ... F(0) Φ."""
     if not has_kernels(J):
-        F = linearise_at(weights, J).F
+        F = linearise_at(W, J).F
         return linear_recurrence(F, torch.zeros_like(F), Phi)[:, -1]
     Phi = Phi.clone(memory_format=torch.contiguous_format)
-    spread(_transition, len(Phi), *_matrices(weights), to_numpy(J), Phi.numpy())
+    spread(_transition, len(Phi), *_matrices(W), to_numpy(J), Phi.numpy())
     return Phi
 
 
 @torch.no_grad()
-def monodromy(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R nx nx"]:
+def monodromy(model: LFRCell | Weights, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R nx nx"]:
     """Transition matrix over a whole record: the product of all F(k)."""
-    weights = dict(cell.named_parameters())
-    Phi = torch.eye(cell.nx).to(z).expand(len(z), cell.nx, cell.nx)
+    W = model.weights()
+    Phi = torch.eye(W.nx).to(z).expand(len(z), W.nx, W.nx)
     for part in z.split(max(1, PASS // len(z)), dim=1):
-        Phi = transition(weights, static_slope(cell, part), Phi)
+        Phi = transition(W, static_slope(W, part), Phi)
     return Phi
 
 
-def _matrices(weights: Weights) -> list[NDArray]:
-    return [to_numpy(weights[name]) for name in ("A", "Bw", "Cz")]
+def _matrices(W: Weights) -> list[NDArray]:
+    return [to_numpy(part) for part in (W.A, W.Bw, W.Cz)]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _forwards(r, A, Bw, Cz, J, g, s):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _forwards(first, jobs, step, A, Bw, Cz, J, g, s):
+    for r in range(first, jobs, step):
+        _forwards_of(r, A, Bw, Cz, J, g, s)
+
+
+@njit(nogil=True, error_model="numpy", fastmath={"contract"})
+def _forwards_of(r, A, Bw, Cz, J, g, s):
     # Transposed, so that inner loops run over neighbours in memory: vector instructions.
     AT, BwT, J, g, s = A.T.copy(), Bw.T.copy(), J[r], g[r], s[r]
     nw, nx = BwT.shape
@@ -95,8 +102,14 @@ def _forwards(r, A, Bw, Cz, J, g, s):
             flush(s[k + 1 : k + 2])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _backwards(r, A, Bw, Cz, J, g, s):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _backwards(first, jobs, step, A, Bw, Cz, J, g, s):
+    for r in range(first, jobs, step):
+        _backwards_of(r, A, Bw, Cz, J, g, s)
+
+
+@njit(nogil=True, error_model="numpy", fastmath={"contract"})
+def _backwards_of(r, A, Bw, Cz, J, g, s):
     BwT, J, g, s = Bw.T.copy(), J[r], g[r], s[r]
     nw, nx = BwT.shape
     for k in range(len(g) - 1, -1, -1):

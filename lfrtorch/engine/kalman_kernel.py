@@ -26,43 +26,32 @@ import math
 import numpy as np
 from numba import njit
 
-from lfrtorch.engine.simulation_kernel import activate, affine, slope_of
+from lfrtorch.engine.simulation_kernel import affine, matrices
+from lfrtorch.maps.machine_code import call_slope, call_value, prepared
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def filter_record(
-    u, y, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth, G, x, U
-):
+def filter_record(u, y, sizes, weights, code, G, x, U):
     """Filter all samples: x and U go to the end, and log p(y) is returned; NaN in y is missing.
-
-    The weights between y and G are those that ``simulate_record`` takes.
 
     Shape:
         u: (T, nu), y: (T, ny), G: (ny + nx, ny + nx), x: (nx,), U: (nx, nx).
     """
     w_hat, total = np.empty(len(x)), 0.0
     for k in range(len(u)):
-        M, known, log_p = correct_sample(
-            u[k], y[k], A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth,
-            G, x, U, w_hat,
-        )  # fmt: skip
-        advance_sample(
-            u[k], A, Bu, Bw, Cz, Dzu, WzT, Ww, bz, bw, activation, growth, M, known, w_hat, x, U
-        )
+        M, known, log_p = correct_sample(u[k], y[k], sizes, weights, code, G, x, U, w_hat)
+        advance_sample(u[k], sizes, weights, code, M, known, w_hat, x, U)
         total += log_p
     return total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def correct_sample(
-    u, y, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth, G, x, U, w_hat
-):
+def correct_sample(u, y, sizes, weights, code, G, x, U, w_hat):
     """``correct`` by the outputs of a sample, (nu,) and (ny,)."""
-    (nx, nw), nz, ny = Bw.shape, len(Cz), len(Cy)
-    z, w, J = np.empty(nz), np.empty(nw), np.empty((nw, nz))
+    _, _, Bw, Cz, Dzu, Cy, Dyu, Dyw, phi = matrices(sizes, weights)
+    (nx, nw), ny = Bw.shape, len(Cy)
     e, H, by_x = np.empty(ny), np.empty((ny, nx)), np.empty((nw, nx))
-    affine(Cz, x, Dzu, u, z)
-    _static(z, WzT, Ww, bz, bw, activation, growth, w, J)
+    w, J = _static(Cz, x, Dzu, u, nw, phi, code)
     affine(Cy, x, Dyu, u, e)
     for i in range(ny):
         e[i] = y[i] - e[i]
@@ -73,15 +62,12 @@ def correct_sample(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance_sample(
-    u, A, Bu, Bw, Cz, Dzu, WzT, Ww, bz, bw, activation, growth, M, known, w_hat, x, U
-):
+def advance_sample(u, sizes, weights, code, M, known, w_hat, x, U):
     """Take x and U to the next sample, from what ``correct_sample`` returned."""
-    (nx, nw), nz = Bw.shape, len(Cz)
-    z, w, J = np.empty(nz), np.empty(nw), np.empty((nw, nz))
+    A, Bu, Bw, Cz, Dzu, _, _, _, phi = matrices(sizes, weights)
+    nx, nw = Bw.shape
     x_next, F, by_x = np.empty(nx), np.empty((nx, nx)), np.empty((nw, nx))
-    affine(Cz, x, Dzu, u, z)
-    _static(z, WzT, Ww, bz, bw, activation, growth, w, J)
+    w, J = _static(Cz, x, Dzu, u, nw, phi, code)
     affine(A, x, Bu, u, x_next)
     for i in range(nx):
         x_next[i] += w_hat[i]
@@ -178,37 +164,15 @@ def _reflect(M, rows):
 
 
 @njit(nogil=True, error_model="numpy")
-def _static(z, WzT, Ww, bz, bw, activation, growth, w, J):
-    """Write w = f(z) and J = ∂w/∂z: derivatives go forward with the values."""
-    nz, nn = len(z), Ww.shape[1]
-    h, dh = np.empty(nn), np.zeros((nn, nz))
-    if len(growth):
-        h[0] = 1.0
-        for n in range(len(growth)):
-            before, factor = growth[n, 0], growth[n, 1]
-            h[n + 1] = h[before] * z[factor]
-            for j in range(nz):
-                dh[n + 1, j] = dh[before, j] * z[factor]
-            dh[n + 1, factor] += h[before]
-    else:
-        for n in range(nn):
-            h[n] = bz[n]
-            for j in range(nz):
-                h[n] += WzT[j, n] * z[j]
-        v = h.copy()
-        activate(activation, h)
-        for n in range(nn):
-            slope = slope_of(activation, v[n], h[n])
-            for j in range(nz):
-                dh[n, j] = WzT[j, n] * slope
-    for q in range(len(w)):
-        w[q] = bw[q]
-        for n in range(nn):
-            w[q] += Ww[q, n] * h[n]
-        for j in range(nz):
-            J[q, j] = 0.0
-            for n in range(nn):
-                J[q, j] += Ww[q, n] * dh[n, j]
+def _static(Cz, x, Dzu, u, nw, phi, code):
+    """The output w = f(z) of the static map and J = ∂w/∂z."""
+    z, w, J, room = np.empty(len(Cz)), np.empty(nw), np.empty((nw, len(Cz))), prepared(code, phi)
+    affine(Cz, x, Dzu, u, z)
+    if nw:
+        call_value(code[1], code[3], code[4], phi, z, w, room)
+        by_weight = np.empty(nw * len(phi))
+        call_slope(code[2], code[3], code[4], phi, z, J, by_weight, len(phi), room)
+    return w, J
 
 
 @njit(nogil=True, error_model="numpy")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -10,10 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import linearise_static, of_static
-
-Weights = Mapping[str, Tensor]
-"""Parameters of a cell by name."""
+from lfrtorch.engine.weights import Weights
+from lfrtorch.maps.linearised import linearise_map
 
 PASS = 1 << 14
 """Most samples, of all records together, that are linearised in one pass."""
@@ -27,31 +24,33 @@ class Linearised(NamedTuple):
 
 
 @torch.no_grad()
-def linearise(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Linearised:
+def linearise(model: LFRCell | Weights, z: Float[Tensor, "R T nz"]) -> Linearised:
     """F and H along a trajectory, which depend on the input z of the static map alone."""
-    return linearise_at(dict(cell.named_parameters()), static_slope(cell, z))
+    W = model.weights()
+    return linearise_at(W, static_slope(W, z))
 
 
 @torch.no_grad()
-def static_slope(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R T nw nz"]:
+def static_slope(
+    model: LFRCell | Weights, z: Float[Tensor, "R T nz"]
+) -> Float[Tensor, "R T nw nz"]:
     """∂w/∂z of the static map at every sample."""
-    return linearise_static(cell.static, z, of_static(dict(cell.named_parameters()))).J
+    W = model.weights()
+    return linearise_map(W.map, z, W.phi, W.layout.code).J
 
 
-def linearise_at(weights: Weights, J: Float[Tensor, "R T nw nz"]) -> Linearised:
+def linearise_at(W: Weights, J: Float[Tensor, "R T nw nz"]) -> Linearised:
     """F = A + Bw J Cz and H = Cy + Dyw J Cz, with J = ∂w/∂z.
 
     Both are linear in J: its entries times one constant matrix give [F; H]. That is one large
     product, twenty times faster than small ones at every sample.
     """
-    A, Cz = weights["A"], weights["Cz"]
     # products[(q, j), (i, l)] = [Bw; Dyw][i, q] Cz[j, l]
-    left = torch.cat([weights["Bw"], weights["Dyw"]], dim=-2)
-    products = torch.einsum("...iq,...jl->...qjil", left, Cz).flatten(-2).flatten(-3, -2)
-    constant = torch.cat([A, weights["Cy"]], dim=-2).flatten(-2).unsqueeze(-2)
-    nx = A.shape[-1]
-    both = (J.flatten(-2) @ products + constant).unflatten(-1, (-1, nx))
-    return Linearised(both[..., :nx, :], both[..., nx:, :])
+    left = torch.cat([W.Bw, W.Dyw], dim=-2)
+    products = torch.einsum("iq,jl->qjil", left, W.Cz).flatten(-2).flatten(-3, -2)
+    constant = torch.cat([W.A, W.Cy], dim=-2).flatten(-2).unsqueeze(-2)
+    both = (J.flatten(-2) @ products + constant).unflatten(-1, (-1, W.nx))
+    return Linearised(both[..., : W.nx, :], both[..., W.nx :, :])
 
 
 def spectral_radius(matrices: Float[Tensor, "*axes n n"]) -> Float[Tensor, "*axes"]:

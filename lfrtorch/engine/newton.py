@@ -16,6 +16,7 @@ from torch.nn.functional import pad
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linear_recurrence import linear_recurrence
 from lfrtorch.engine.linearised import linearise, spectral_radius
+from lfrtorch.engine.weights import Weights
 
 MAX_NEWTON = 20
 """Iterations after which Newton's method is given up; from a nearby trajectory it needs 3 or 4."""
@@ -29,7 +30,7 @@ Convergence is quadratic, so the error left is about eps: the rounding of the lo
 
 @torch.no_grad()
 def newton_states(
-    cell: LFRCell,
+    model: LFRCell | Weights,
     u: Float[Tensor, "R T nu"],
     x0: Float[Tensor, "R nx"],
     *,
@@ -47,16 +48,17 @@ def newton_states(
         Lim, Zhu, Selfridge and Kasim, "Parallelizing non-linear sequential models over the sequence
         length", ICLR 2024.
     """
+    W = model.weights()
     tolerance = _UPDATE_ROUNDING * torch.finfo(u.dtype).eps ** 0.5
     x = x0.unsqueeze(1).expand(-1, u.shape[1] + 1, -1) if guess is None else guess
-    driven = u @ cell.Bu.mT
-    transition, found = cell.A, torch.zeros(len(u), dtype=torch.bool)  # before the first iteration
+    driven = u @ W.Bu.mT
+    transition, found = W.A, torch.zeros(len(u), dtype=torch.bool)  # before the first iteration
     for _ in range(MAX_NEWTON):
-        z, w = cell.internal(u, x[:, :-1])
-        defect = x[:, :-1] @ cell.A.mT + driven + w @ cell.Bw.mT - x[:, 1:]
+        z, w = W.internal(u, x[:, :-1])
+        defect = x[:, :-1] @ W.A.mT + driven + w @ W.Bw.mT - x[:, 1:]
         gap = (x[:, -1] if periodic else x0) - x[:, 0]
         # `defect` is f(x(k), u(k)) - x(k+1), and `gap` that of the boundary: both 0 when found.
-        update, transition = (_closed if periodic else _open)(linearise(cell, z).F, defect, gap)
+        update, transition = (_closed if periodic else _open)(linearise(W, z).F, defect, gap)
         x = x + update
         change, size = (signal.abs().amax(dim=(1, 2)) for signal in (update, x))
         found = change <= tolerance * (1.0 + size)  # False for NaN

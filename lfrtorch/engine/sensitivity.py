@@ -23,24 +23,24 @@ They pass over time in blocks, so that memory does not grow with the length of a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from functools import cached_property, lru_cache
+from collections.abc import Iterator
+from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lfrtorch._support.threads import has_kernels, spread, to_numpy, workers
+from lfrtorch._support.threads import spread_loop, workers
 from lfrtorch.engine.blocked_kernel import blocked_rows
-from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.feedback_recurrence import states, transition
 from lfrtorch.engine.jacobian_kernel import jacobian_rows
 from lfrtorch.engine.linear_recurrence import linear_recurrence
-from lfrtorch.engine.linearised import PASS, Linearised, linearise_at
-from lfrtorch.engine.nonlinearity import is_network, known_parts, linearise_static, of_static
-from lfrtorch.engine.simulation import Trajectory
-from lfrtorch.engine.static_jacobian import NetworkJacobian, StaticJacobian
+from lfrtorch.engine.linearised import PASS, linearise_at
+from lfrtorch.engine.simulation import Numbers, Trajectory
+from lfrtorch.engine.weights import DirectTerms, Weights
+from lfrtorch.maps.linearised import LinearisedMap, linearise_map
 
 _FADED = 1e-18
 """An initial state is forgotten when less than this fraction of it is left."""
@@ -50,123 +50,10 @@ BLOCK, _BLOCK_BYTES = 8192, 1 << 24
 leaves the cache before it is used takes up to 15 % longer."""
 
 KEPT = 1 << 16
-"""Most samples at which a network is linearised once for all passes of an iteration: of 20 neurons
-and 30 states, 50 MB."""
+"""Most samples at which a compiled map is linearised once for all passes of an iteration."""
 
 MANY_STATES = 8
 """Number of states from which ``blocked_rows`` is the faster kernel."""
-
-
-_EQUATIONS = {
-    "x": {"A": "x", "Bu": "u", "Bw": "w"},
-    "z": {"Cz": "x", "Dzu": "u"},
-    "y": {"Cy": "x", "Dyu": "u", "Dyw": "w"},
-}
-"""For each equation its matrices, in the order of the parameters, and what each multiplies."""
-
-
-class DirectTerms(NamedTuple):
-    """Direct terms of some columns.
-
-    A triple (column, row, regressor) in ``x``, ``z`` or ``y``: the column's parameter multiplies
-    ``v[regressor]`` in that row of the equation. Columns of the static map begin at ``first``;
-    ``static`` has their positions among all weights of the map.
-    """
-
-    x: Int[Tensor, "n_x 3"]
-    z: Int[Tensor, "n_z 3"]
-    y: Int[Tensor, "n_y 3"]
-    static: Int[Tensor, " n_static"]
-    first: int
-
-
-def layout(cell: LFRCell, *, every: bool = False) -> Layout:
-    """Layout of the free parameters, or of every one; cells of one structure share the object."""
-    parameters = tuple(
-        (name, p.numel(), every or p.requires_grad) for name, p in cell.named_parameters()
-    )
-    return _layout(cell.nx, cell.nu, cell.ny, cell.nz, cell.nw, parameters)
-
-
-class Layout:
-    """Where parameters (name, size, whether free) stand: in θ (the free), and in the equations."""
-
-    def __init__(
-        self,
-        nx: int,
-        nu: int,
-        ny: int,
-        nz: int,
-        nw: int,
-        parameters: tuple[tuple[str, int, bool], ...],
-    ) -> None:
-        self.rows = {"x": nx, "z": nz, "y": ny}
-        self.width = nx + nu + nw
-        first_in_v, size = {"x": 0, "u": nx, "w": nx + nu}, {"x": nx, "u": nu, "w": nw}
-        places = {
-            name: (e, self.rows[left], first_in_v[right], size[right])
-            for e, (left, matrices) in enumerate(_EQUATIONS.items())
-            for name, right in matrices.items()
-        }
-        # For every element of θ: equation, row, regressor. Those of the static map have equation 3,
-        # and their position in the map for the other two.
-        table = []
-        self.weights = 0
-        for name, count, free in parameters:
-            if name in places:
-                e, n, first, m = places[name]
-                row = torch.arange(n).repeat_interleave(m)
-                entries = torch.stack(
-                    [torch.full_like(row, e), row, first + torch.arange(m).repeat(n)]
-                )
-            else:
-                position = self.weights + torch.arange(count)
-                entries = torch.stack([torch.full_like(position, 3), position, position])
-                self.weights += count
-            if free:
-                table.append(entries)
-        self.table = torch.cat([torch.zeros(3, 0, dtype=torch.int64), *table], dim=1)
-
-    def columns(self, kept: Int[Tensor, " K"]) -> DirectTerms:
-        """The direct terms of the kept parameters, given by ascending positions in θ."""
-        equation, row, regressor = self.table[:, kept.cpu()]
-        column = torch.arange(len(equation))
-        entries = torch.stack([column, row, regressor], dim=1)
-        x, z, y = (entries[equation == e] for e in range(3))
-        static = row[equation == 3]
-        return DirectTerms(x, z, y, static, len(column) - len(static))
-
-    def matrices(self, theta: Float[Tensor, "*axes P"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """[A Bu Bw], [Cz Dzu 0], [Cy Dyu Dyw] and the weights of the static map in θ."""
-        equation, row, regressor = self.table.to(theta.device)
-        parts = []
-        for e, rows in enumerate(self.rows.values()):
-            own = equation == e
-            matrix = theta.new_zeros(*theta.shape[:-1], rows, self.width)
-            matrix[..., row[own], regressor[own]] = theta[..., own]
-            parts.append(matrix)
-        static = theta.new_zeros(*theta.shape[:-1], self.weights)
-        static[..., row[equation == 3]] = theta[..., equation == 3]
-        return *parts, static
-
-    def vector(
-        self,
-        x: Float[Tensor, "R nx v"],
-        z: Float[Tensor, "R nz v"],
-        y: Float[Tensor, "R ny v"],
-        static: Float[Tensor, "R weights"],
-    ) -> Float[Tensor, "R P"]:
-        """θ from such matrices: the inverse of ``matrices``."""
-        equation, row, regressor = self.table.to(x.device)
-        theta = x.new_empty(len(x), len(equation))
-        for e, matrix in enumerate((x, z, y)):
-            own = equation == e
-            theta[:, own] = matrix[:, row[own], regressor[own]]
-        theta[:, equation == 3] = static[:, row[equation == 3]]
-        return theta
-
-
-_layout = lru_cache(maxsize=64)(Layout)
 
 
 class Rows(NamedTuple):
@@ -186,74 +73,57 @@ class Adjoint(NamedTuple):
     x0: Float[Tensor, "R nx"]
 
 
-class _Block:
-    """The model linearised at neighbouring samples of some records, with v = [x; u; w]."""
+class _Block(NamedTuple):
+    """The model linearised at neighbouring samples of some records."""
 
-    def __init__(
-        self,
-        time: slice,
-        v: Float[Tensor, "R B v"],
-        static: StaticJacobian,
-        weights: dict[str, Tensor],
-    ) -> None:
-        self.time, self.v, self.static, self._weights = time, v, static, weights
-
-    @cached_property
-    def linearised(self) -> Linearised:
-        """x+ = F x, y = H x."""
-        return linearise_at(self._weights, self.static.J)
+    records: slice
+    time: slice
+    static: LinearisedMap
 
 
 class Linearisation:
     """The model linearised along a trajectory.
 
     Args:
-        cell: the model; parameters with ``requires_grad=False`` are no part of θ. Its weights are
-            copied.
-        u, trajectory: input and signals of this cell.
+        model: the numbers; those of parameters with ``requires_grad=False`` are no part of θ.
+        u, trajectory: input and signals of this model.
         periodic: whether the initial state is the end state, whatever the parameters. Otherwise it
             does not depend on them.
-        weights: to use instead of the cell's own, in their order; all of them are θ then.
+        every: whether all numbers are θ.
     """
 
     @torch.no_grad()
     def __init__(
         self,
-        cell: LFRCell,
+        model: Numbers,
         u: Float[Tensor, "R T nu"],
         trajectory: Trajectory,
         *,
         periodic: bool = False,
-        weights: Sequence[Tensor] | None = None,
+        every: bool = False,
     ) -> None:
+        self.weights = W = model.weights()
         self.u, self.trajectory, self.periodic = u, trajectory, periodic
-        self.static = cell.static
-        own = cell.parameters() if weights is None else weights
-        names = [name for name, _ in cell.named_parameters()]
-        self.weights = {n: p.detach().clone() for n, p in zip(names, own, strict=True)}
-        self.layout = layout(cell, every=weights is not None)
-        self.parameters = self.layout.table.shape[1]
+        self.free = np.arange(len(W.flat)) if every else W.layout.free
+        self.parameters = len(self.free)
         """P."""
-        self.state = u.new_zeros(len(u), cell.nx)
-        self._ny = cell.ny
+        self._compiled = W.layout.compiled and u.dtype == torch.float64
         self._known_transition: tuple[Tensor, list[slice]] | None = None
+
+    @property
+    def state(self) -> Float[Tensor, "R nx"]:
+        """Zeros."""
+        return self.u.new_zeros(len(self.u), self.weights.nx)
+
+    def columns(self, kept: Int[Tensor, " K"]) -> DirectTerms:
+        """The direct terms of the kept parameters, given by ascending positions in θ."""
+        return self.weights.layout.direct_terms(self.free[kept.cpu().numpy()])
 
     def signals(self, records: slice, time: slice) -> Float[Tensor, "R B v"]:
         """v = [x; u; w]."""
         t = self.trajectory
         return torch.cat([s[records, time] for s in (t.x, self.u, t.w)], dim=-1)
 
-    @cached_property
-    def _whole(self) -> _Block | None:
-        """All samples, kept from one pass to the next if they are few."""
-        R, T = self.u.shape[:2]
-        fast = is_network(self.static) or known_parts(self.static) is not None
-        few = KEPT if has_kernels(self.u) and fast else PASS
-        if few < R * T:
-            return None
-        return self._at(slice(0, R), slice(0, T))
-
-    @torch.no_grad()
     def rows(
         self,
         kept: Int[Tensor, " K"],
@@ -261,6 +131,7 @@ class Linearisation:
         initial_state: bool,
         spare: int = 0,
         out: Float[Tensor, "R T ny columns"] | None = None,
+        faded: float = 0.0,
     ) -> Iterator[Rows]:
         """Rows of dy/dθ with the initial state held, block by block.
 
@@ -269,37 +140,38 @@ class Linearisation:
             initial_state: whether nx columns for the initial state follow.
             spare: columns without a value at the end of the rows, for the caller to fill.
             out: all rows, if they are to be kept; a block is then all samples of its records.
+            faded: derivatives of the state below which the rest of a record is left out.
         """
-        columns = self.layout.columns(kept)
-        R, nx = self.state.shape
-        compiled = has_kernels(self.u)
-        samples = PASS
-        if compiled:
-            row = self._ny * (len(kept) + nx * initial_state + spare) * self.u.element_size()
+        columns, W = self.columns(kept), self.weights
+        (R, T), nx, ny = self.u.shape[:2], W.nx, W.ny
+        width, samples = len(kept) + nx * initial_state, PASS
+        if self._compiled:
+            row = ny * (width + spare) * self.u.element_size()
             samples = min(BLOCK, max(1, _BLOCK_BYTES // max(1, row)))
-        Phi = self.state.new_empty(R, nx, nx * initial_state)
+        Phi = self.u.new_empty(R, nx, nx * initial_state)
         # Blocks do not depend on the number of threads, and so neither do sums over them.
-        together = 1 if compiled else R
-        for records in _slices(R, max(together, samples // self.u.shape[1])):
-            S = self.state.new_zeros(len(self.u[records]), nx, len(kept) + nx * initial_state)
+        together = 1 if self._compiled else R
+        for records in _slices(R, max(together, samples // T)):
+            S = self.u.new_zeros(records.stop - records.start, nx, width)
             if initial_state:
                 S[:, :, len(kept) :] = torch.eye(nx).to(S)
             # The kernel writes to contiguous memory: of `out` only whole records are that.
-            length = self.u.shape[1] if out is not None else max(1, samples // len(S))
-            for time in _slices(self.u.shape[1], length):
-                block = self._block(records, time)
+            length = T if out is not None else max(1, samples // len(S))
+            for time in _slices(T, length):
                 if out is None:
-                    rows = S.new_empty(*block.v.shape[:2], self._ny, S.shape[-1] + spare)
+                    rows = S.new_empty(len(S), time.stop - time.start, ny, width + spare)
                 else:
                     rows = out[records, time]
-                write = self._rows_compiled if compiled else self._rows_generic
-                S = write(block, columns, S, rows)
-                if initial_state and time.stop == self.u.shape[1]:
+                write = self._rows_compiled if self._compiled else self._rows_generic
+                S = write(records, time, columns, S, rows)
+                if initial_state and time.stop == T:
                     Phi[records] = S[:, :, len(kept) :]
                     # If it has faded, fewer blocks are enough.
                     if records.stop == R and Phi.abs().amax() >= _FADED:
                         self._known_transition = Phi, self._times
                 yield Rows(records, time, rows, S)
+                if faded and S.abs().amax() < faded:
+                    break
 
     def tangent(
         self, d_theta: Float[Tensor, " P"], d_x0: Float[Tensor, "R nx"] | None = None
@@ -330,42 +202,52 @@ class Linearisation:
         d_u: Float[Tensor, "R T nu"] | None = None,
     ) -> Iterator[tuple[Float[Tensor, "R _ ny"], Float[Tensor, "R nx"]]]:
         """Changes of the outputs in each block, and of the state after it."""
-        d_x, d_z, d_y, d_static = self.layout.matrices(d_theta)
-        W = self.weights
+        W, t = self.weights, self.trajectory
+        whole = torch.zeros_like(W.flat)
+        whole[torch.from_numpy(self.free)] = d_theta
+        d = Weights(W.layout, whole)
         for block in self._blocks():
-            J, v = block.static.J, block.v
-            by_x, by_z, by_y = v @ d_x.mT, v @ d_z.mT, v @ d_y.mT
+            J, time = block.static.J, block.time
+            x, u, w = t.x[:, :-1][:, time], self.u[:, time], t.w[:, time]
+            by_x = x @ d.A.mT + u @ d.Bu.mT + w @ d.Bw.mT
+            by_z = x @ d.Cz.mT + u @ d.Dzu.mT
+            by_y = x @ d.Cy.mT + u @ d.Dyu.mT + w @ d.Dyw.mT
             if d_u is not None:
-                part = d_u[:, block.time]
-                by_x += part @ W["Bu"].mT
-                by_z += part @ W["Dzu"].mT
-                by_y += part @ W["Dyu"].mT
-            d_w = _apply(J, by_z) + block.static.tangent(d_static)
-            every = states(W, J, by_x + d_w @ W["Bw"].mT, s)
+                part = d_u[:, time]
+                by_x += part @ W.Bu.mT
+                by_z += part @ W.Dzu.mT
+                by_y += part @ W.Dyu.mT
+            d_w = _apply(J, by_z) + block.static.tangent(d.phi)
+            every = states(W, J, by_x + d_w @ W.Bw.mT, s)
             s, d_states = every[:, -1], every[:, :-1]
-            d_w += _apply(J, d_states @ W["Cz"].mT)
-            yield d_states @ W["Cy"].mT + by_y + d_w @ W["Dyw"].mT, s
+            d_w += _apply(J, d_states @ W.Cz.mT)
+            yield d_states @ W.Cy.mT + by_y + d_w @ W.Dyw.mT, s
 
     @torch.no_grad()
     def adjoint(
         self, e: Float[Tensor, "R T ny"], end: Float[Tensor, "R nx"] | None = None
     ) -> Adjoint:
         """Derivatives of Σ e(k) · y(k), and of end · x(T) unless a record is periodic."""
-        W = self.weights
+        W, t = self.weights, self.trajectory
         end = self._periodic_costate(e) if self.periodic else self.state if end is None else end
-        parts, by_u = [], []
+        theta, by_u = 0.0, []
         for block in self._blocks(backwards=True):
-            e_block = e[:, block.time]
+            time = block.time
+            e_block = e[:, time]
             costates = self._costates(block, e, end)
             ahead, end = costates[:, 1:], costates[:, 0]
             # λ(k+1) and e(k) are the weights of x(k+1) and y(k): pass them back to w, z and θ.
-            d_w = ahead @ W["Bw"] + e_block @ W["Dyw"]
+            d_w = ahead @ W.Bw + e_block @ W.Dyw
             d_z = _apply(block.static.J.mT, d_w)
-            linear = (signal.mT @ block.v for signal in (ahead, d_z, e_block))
-            by_x, by_z, by_y = linear
-            parts.append(self.layout.vector(by_x, by_z, by_y, block.static.adjoint(d_w)))
-            by_u.append(ahead @ W["Bu"] + e_block @ W["Dyu"] + d_z @ W["Dzu"])
-        return Adjoint(torch.stack(parts).sum(0), torch.cat(by_u[::-1], dim=1), end)
+            x, u, w = t.x[:, :-1][:, time], self.u[:, time], t.w[:, time]
+            pairs = (ahead, x), (ahead, u), (ahead, w), (d_z, x), (d_z, u)
+            pairs += (e_block, x), (e_block, u), (e_block, w)
+            parts = [(left.mT @ right).flatten(1) for left, right in pairs]
+            theta = theta + torch.cat([*parts, block.static.adjoint(d_w)], dim=1)
+            by_u.append(ahead @ W.Bu + e_block @ W.Dyu + d_z @ W.Dzu)
+        assert isinstance(theta, Tensor)
+        own = theta[:, torch.from_numpy(self.free)]
+        return Adjoint(own, torch.cat(by_u[::-1], dim=1), end)
 
     def _periodic_costate(self, e: Float[Tensor, "R T ny"]) -> Float[Tensor, "R nx"]:
         """λ(T) = λ(0) in periodic steady state.
@@ -376,7 +258,7 @@ class Linearisation:
         Phi, times = self._transition
         end = self.state
         for time in reversed(times):
-            block = self._whole or self._block(slice(0, len(e)), time)
+            block = self._block(slice(0, len(e)), time)
             end = self._costates(block, e, end)[:, 0]
         return fixed_point(Phi.mT, end.unsqueeze(-1)).squeeze(-1)
 
@@ -401,77 +283,80 @@ class Linearisation:
         """λ(k) = F(k)ᵀ λ(k+1) + H(k)ᵀ e(k) in a block, from λ at its end."""
         W, J = self.weights, block.static.J
         e = e[:, block.time]
-        g = e @ W["Cy"] + _apply(J.mT, e @ W["Dyw"]) @ W["Cz"]  # Hᵀ e
+        g = e @ W.Cy + _apply(J.mT, e @ W.Dyw) @ W.Cz  # Hᵀ e
         return states(W, J, g, end, backwards=True)
 
     def _blocks(self, *, backwards: bool = False) -> Iterator[_Block]:
         """All records, block by block in time, or at once if they are few."""
         everything = slice(0, len(self.u))
         for time in reversed(self._times) if backwards else self._times:
-            yield self._whole or self._block(everything, time)
+            yield self._block(everything, time)
+
+    @cached_property
+    def _whole(self) -> _Block | None:
+        """All samples, kept from one pass to the next if they are few."""
+        R, T = self.u.shape[:2]
+        return self._at(slice(0, R), slice(0, T)) if self._few else None
 
     @property
     def _times(self) -> list[slice]:
         """The blocks of samples."""
-        T = self.u.shape[1]
-        return list(_slices(T, T if self._whole else max(1, PASS // len(self.u))))
+        R, T = self.u.shape[:2]
+        return list(_slices(T, T if self._few else max(1, PASS // R)))
+
+    @property
+    def _few(self) -> bool:
+        """Whether there are so few samples that they are linearised at once."""
+        R, T = self.u.shape[:2]
+        return (KEPT if self._compiled else PASS) >= R * T
 
     def _block(self, records: slice, time: slice) -> _Block:
-        if self._whole is None:
-            return self._at(records, time)
-        v, static = self._whole.v[records, time], self._whole.static.part(records, time)
-        return _Block(time, v, static, self.weights)
+        whole = self._whole
+        same = whole is not None and (records, time) == (whole.records, whole.time)
+        return whole if whole is not None and same else self._at(records, time)
 
     def _at(self, records: slice, time: slice) -> _Block:
-        of_map = of_static(self.weights)
-        static = linearise_static(self.static, self.trajectory.z[records, time], of_map)
-        return _Block(time, self.signals(records, time), static, self.weights)
+        W, z = self.weights, self.trajectory.z[records, time]
+        return _Block(records, time, linearise_map(W.map, z, W.phi, W.layout.code))
 
-    def _by_weight(self, block: _Block, columns: DirectTerms) -> Tensor:
-        by_weight = block.static.by_weight()
-        if len(columns.static) == self.layout.weights:
-            return by_weight
-        return by_weight[..., columns.static.to(by_weight.device)]
-
-    def _rows_generic(self, block: _Block, columns: DirectTerms, S: Tensor, rows: Tensor) -> Tensor:
+    def _rows_generic(
+        self, records: slice, time: slice, columns: DirectTerms, S: Tensor, rows: Tensor
+    ) -> Tensor:
         """Write the rows of a block and return the next S: in torch, on any device."""
-        J, v, by_weight = block.static.J, block.v, self._by_weight(block, columns)
-        C = S.shape[-1]
-        d_w = v.new_zeros(*v.shape[:2], J.shape[2], C)
-        x, z, y = (entries.to(v.device) for entries in columns[:3])
+        W, static, v = self.weights, self._at(records, time).static, self.signals(records, time)
+        J, C, device = static.J, S.shape[-1], S.device
+        x, z, y, own = (torch.from_numpy(part).to(device) for part in columns)
+        first = len(x) + len(z) + len(y)
+        d_w = v.new_zeros(*v.shape[:2], W.nw, C)
         d_w[..., z[:, 0]] = J[..., z[:, 1]] * v[..., z[:, 2]].unsqueeze(2)
-        d_w[..., columns.first : columns.first + by_weight.shape[-1]] = by_weight
-        G, E = self.weights["Bw"] @ d_w, self.weights["Dyw"] @ d_w
+        d_w[..., first : first + len(own)] = static.by_weight()[..., own]
+        G, E = W.Bw @ d_w, W.Dyw @ d_w
         G[..., x[:, 1], x[:, 0]] += v[..., x[:, 2]]
         E[..., y[:, 1], y[:, 0]] += v[..., y[:, 2]]
-        every = linear_recurrence(block.linearised.F, G, S)
-        rows[..., :C] = block.linearised.H @ every[:, :-1] + E
+        F, H = linearise_at(W, J)
+        every = linear_recurrence(F, G, S)
+        rows[..., :C] = H @ every[:, :-1] + E
         return every[:, -1]
 
     def _rows_compiled(
-        self, block: _Block, columns: DirectTerms, S: Tensor, rows: Tensor
+        self, records: slice, time: slice, columns: DirectTerms, S: Tensor, rows: Tensor
     ) -> Tensor:
         """The same in machine code; S is never stored over time, and is changed in place."""
-        R = len(S)
-        W = [self.weights[name] for name in ("A", "Bw", "Cz", "Cy", "Dyw")]
+        R, t = len(S), self.trajectory
         chunks = 1 if R % workers() == 0 else workers()
-        static, none = block.static, S.new_zeros(R, len(block.v[0]), 0)
-        whole = len(columns.static) == self.layout.weights
-        if isinstance(static, NetworkJacobian) and whole:
-            by_weight = (none.unsqueeze(2), static.slope, static.h, static.Ww, static.z)
-        else:
-            by_weight = (self._by_weight(block, columns), none, none, none[0], none)
-        tensors = (*W, static.J, block.v, *by_weight, *columns[:3])
-        arguments = (*map(to_numpy, tensors), columns.first, chunks, S.numpy(), rows.numpy())
+        signals = (s.numpy() for s in (self.u, t.x, t.z, t.w))
         kernel = blocked_rows if S.shape[1] >= MANY_STATES else jacobian_rows
-        spread(kernel, R * chunks, *arguments)
+        at = records.start, time.start, *columns, chunks
+        spread_loop(
+            kernel, R * chunks, *self.weights.arguments, *signals, *at, S.numpy(), rows.numpy()
+        )
         return S
 
 
 def output_jacobian(linearisation: Linearisation) -> Float[Tensor, "R T ny columns"]:
     """dy/dθ as a whole; unless the record is periodic, nx columns of the initial state follow."""
     everything = torch.arange(linearisation.parameters)
-    P, nx = len(everything), linearisation.state.shape[1]
+    P, nx = len(everything), linearisation.weights.nx
     y = linearisation.trajectory.y
     rows, end = y.new_empty(*y.shape, P + nx), y.new_empty(len(y), nx, P + nx)
     for block in linearisation.rows(everything, initial_state=True):

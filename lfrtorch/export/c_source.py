@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from lfrtorch._support.types import Array
-from lfrtorch.engine.formula_code import PYTHON, statements, with_slopes
-from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.engine.operations import Formula
 from lfrtorch.export.equations import (
     Equations,
     KalmanNoise,
@@ -18,10 +16,11 @@ from lfrtorch.export.equations import (
     check_name,
     equations,
     observer_equations,
-    rendered,
 )
 from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.maps.formula_code import PYTHON, statements, with_slopes
+from lfrtorch.maps.operations import Formula
 from lfrtorch.model import Model
 
 _LINE = 96
@@ -59,7 +58,7 @@ def c_source(
         The texts of ``NAME.h`` and ``NAME.c``.
 
     Raises:
-        ValueError: a static map of the user's own class, a name that is no identifier, or an
+        ValueError: a static map without equations, a name that is no identifier, or an
             observer that the model has not.
 
     Example:
@@ -71,9 +70,9 @@ def c_source(
     """
     check_name(name)
     e = equations(model)
-    known = {"name": name, "NAME": name.upper(), "ts": repr(1.0 / e.fs), **e.sizes}
-    known |= {"about": _comment(e.about(name)), "static": e.static, "arrays": list(_arrays(e))}
-    known["rest"], known["feedthrough"] = bool(e.x_rest.size), e.feedthrough
+    known: dict[str, Any] = {"ts": repr(1.0 / e.fs), "about": _comment(e.about(name))}
+    known |= {"constant": _constant, "pairs": _pairs, "operations": _operations}
+    known["arrays"] = list(_arrays(e))
     if e.distance is not None:
         known["distance"] = True
         for symbol, size, value in zip("Tt", ("NZ * NZ", "NZ"), e.distance, strict=True):
@@ -88,26 +87,14 @@ def c_source(
             known["arrays"].append(_constant("G", "NG * NG", G))
             known["arrays"].append("/* U0 times U0 transposed: covariance of x in the data. */")
             known["arrays"].append(_constant("U0", "NX * NX", U))
-    inner = {"NZ": e.sizes["nz"], "NW": e.sizes["nw"]} if e.static else {}
-    match e.static:
-        case Network():
-            known["value"], known["slope"] = e.static.sigma.c
-            known["activation"] = e.static.activation
-            inner["NN"] = len(e.static.bz)
-        case Polynomial():
-            known["monomials"] = True
-            inner |= {"NM": e.static.C.shape[1], "NS": len(e.static.slopes)}
-        case Formula():
-            known["operations"] = _operations(e.static)
-    known["inner"] = inner.items()
-    header, source = rendered("model.h", **known), rendered("model.c", **known)
+    header, source = (e.rendered(file, name, **known) for file in ("model.h", "model.c"))
     return (_single(header), _single(source)) if single else (header, source)
 
 
 _C = {
     name: text.replace("math.", "").replace("abs(", "fabs(") for name, text in PYTHON.items()
 } | {
-    "pow": "pow({0}, {1})", "relu": "{0} > 0.0 ? {0} : 0.0", "where": "{0} ? {1} : {2}",
+    "pow": "pow({0}, {1})", "relu": "{0} < 0.0 ? 0.0 : {0}", "where": "{0} ? {1} : {2}",
     "softplus": "({0} > 0.0 ? {0} : 0.0) + log(1.0 + exp(-fabs({0})))",
     "sign": "{0} > 0.0 ? 1.0 : ({0} < 0.0 ? -1.0 : 0.0)", "maximum": "{0} >= {1} ? {0} : {1}",
     "minimum": "{0} <= {1} ? {0} : {1}", "and": "{0} && {1}", "or": "{0} || {1}", "not": "!{0}",
@@ -140,30 +127,26 @@ def _single(text: str) -> str:
 
 
 def _arrays(e: Equations) -> Iterator[str]:
-    """All constants, in the order in which the equations name them."""
+    """All constants but those of the static map, as the equations name them."""
     sizes = {
         "u_offset": "NU", "y_offset": "NY", "x_rest": "NX", "A": "NX * NX", "Bu": "NX * NU",
         "Bw": "NX * NW", "Cz": "NZ * NX", "Dzu": "NZ * NU", "Cy": "NY * NX", "Dyu": "NY * NU",
-        "Dyw": "NY * NW", "Wz": "NN * NZ", "bz": "NN", "Ww": "NW * NN", "bw": "NW", "C": "NW * NM",
+        "Dyw": "NY * NW",
     }  # fmt: skip
-    for name, value in e.arrays.items():
-        if value.size:
-            yield _constant(name, sizes[name], value)
-    if isinstance(e.static, Polynomial):
-        growth, slopes = (
-            _braces([[f"{{{', '.join(map(str, row))}}}" for row in rows]])
-            for rows in (e.static.growth, e.static.slopes)
-        )
-        yield "/* Monomial i + 1 is one monomial times one z. */"
-        yield f"static const int growth[NM - 1][2] = {growth};"
-        yield "/* (n, j, e, m): the derivative of monomial n by z[j] is e times monomial m. */"
-        yield f"static const int slopes[NS][4] = {slopes};"
+    for name, size in sizes.items():
+        if e.arrays[name].size:
+            yield _constant(name, size, e.arrays[name])
 
 
 def _constant(name: str, size: str, value: Array) -> str:
     """A vector or a matrix, row by row."""
     rows = [[repr(float(number)) for number in row] for row in np.atleast_2d(value)]
     return f"static const double {name}[{size}] = {_braces(rows)};"
+
+
+def _pairs(rows: Array) -> str:
+    """Rows of integers in braces."""
+    return _braces([[f"{{{', '.join(map(str, row))}}}" for row in rows.tolist()]])
 
 
 def _braces(rows: Sequence[Sequence[str]]) -> str:

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.optional import imported
-from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.engine.operations import Formula
-from lfrtorch.export.equations import (
-    Equations,
-    KalmanNoise,
-    check_name,
-    equations,
-    observer_equations,
-)
+from lfrtorch._support.types import Array
+from lfrtorch.export.equations import KalmanNoise, check_name, equations, observer_equations
 from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.maps.operations import Formula
 from lfrtorch.model import Model
 
 
@@ -38,7 +33,7 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
         x: (nx,), u: (nu,) -> x_next: (nx,), y: (ny,).
 
     Raises:
-        ValueError: casadi is not installed, a static map of the user's own class, or a name that is
+        ValueError: casadi is not installed, a static map without equations, or a name that is
             no identifier.
 
     Example:
@@ -57,8 +52,9 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
     v = u - e.u_offset
     M = e.matrices
     x_next, y = ca.mtimes(M.A, x) + ca.mtimes(M.Bu, v), ca.mtimes(M.Cy, x) + ca.mtimes(M.Dyu, v)
-    if e.static is not None:
-        w = _static(ca, e, ca.mtimes(M.Cz, x) + ca.mtimes(M.Dzu, v))
+    if e.map.nw:
+        z = ca.mtimes(M.Cz, x) + ca.mtimes(M.Dzu, v)
+        w = e.written.of(_Expressions(ca, e.weights), z)
         x_next, y = x_next + ca.mtimes(M.Bw, w), y + ca.mtimes(M.Dyw, w)
     return ca.Function(name, [x, u], [x_next, y + e.y_offset], ["x", "u"], ["x_next", "y"])
 
@@ -180,29 +176,36 @@ def casadi_observer(
     return predict, function("correct", [corrected, P_known], ["x_known", "P_known"]), update
 
 
-def _static(ca: Any, e: Equations, z: Any) -> Any:
-    """w = f(z)."""
-    if isinstance(e.static, Polynomial):
-        m = [ca.SX(1.0)]
-        for before, j in e.static.growth:
-            m.append(m[before] * z[j])
-        return ca.mtimes(e.weights["C"], ca.vertcat(*m))
-    if isinstance(e.static, Formula):
-        return ca.vertcat(*e.static.evaluated(ca.vertsplit(z), _operations(ca), ca.SX))
-    assert isinstance(e.static, Network)
-    v = ca.mtimes(e.weights["Wz"], z) + e.weights["bz"]
-    h = e.static.sigma.casadi(ca, v)
-    return ca.mtimes(e.weights["Ww"], h) + e.weights["bw"]
+class _Expressions:
+    """Columns of CasADi, and the arrays of the static map that act on them."""
+
+    def __init__(self, ca: Any, arrays: Mapping[str, Array]) -> None:
+        self.ca, self.arrays, self.operations = ca, arrays, _operations(ca)
+
+    def affine(self, W: str, v: Any, b: str = "") -> Any:
+        """W v + b."""
+        product = self.ca.mtimes(self.arrays[W], v)
+        return product + self.arrays[b] if b else product
+
+    def each(self, sigma: Formula, v: Any) -> Any:
+        """A function of one number, of every entry of v."""
+        return sigma.evaluated([v], self.operations, self.ca.SX)[0]
+
+    def table(self, formula: Formula, v: Any) -> Any:
+        """A function of the entries of v."""
+        entries = self.ca.vertsplit(v)
+        return self.ca.vertcat(*formula.evaluated(entries, self.operations, self.ca.SX))
 
 
 def _operations(ca: Any) -> dict[str, Any]:
-    """Those of formulas."""
+    """Those of formulas, of single expressions or of columns."""
     same = "sqrt exp log sin cos tan asin acos atan atan2 sinh cosh tanh sign"
     return {name: getattr(ca, name) for name in same.split()} | {
         "add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv,
-        "neg": operator.neg, "pow": ca.power, "sigmoid": lambda v: 1.0 / (1.0 + ca.exp(-v)),
+        "neg": operator.neg, "pow": ca.power,
+        "sigmoid": lambda v: 0.5 + 0.5 * ca.tanh(0.5 * v),  # derivatives do not overflow either
         "relu": lambda v: ca.fmax(v, 0.0), "abs": ca.fabs, "where": ca.if_else,
-        "softplus": lambda v: ca.fmax(v, 0.0) + ca.log(1.0 + ca.exp(-ca.fabs(v))),
+        "softplus": lambda v: ca.fmax(v, 0.0) + ca.log1p(ca.exp(-ca.fabs(v))),
         "maximum": ca.fmax, "minimum": ca.fmin, "lt": ca.lt, "le": ca.le, "gt": ca.gt, "ge": ca.ge,
         "and": ca.logic_and, "or": ca.logic_or, "not": ca.logic_not,
     }  # fmt: skip

@@ -6,17 +6,22 @@ from collections.abc import Iterator
 from typing import Any
 
 from lfrtorch._support.optional import imported
-from lfrtorch.engine.formula_code import PYTHON, statements
-from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.engine.operations import Formula
-from lfrtorch.export.equations import Equations, check_name, equations, rendered
+from lfrtorch.export.equations import Equations, check_name, equations
 from lfrtorch.linear.model import LinearModel, control_labels
+from lfrtorch.maps.formula_code import PYTHON, statements
+from lfrtorch.maps.operations import Formula
 from lfrtorch.model import Model
 
 _NUMPY = {
     name: text.replace("math.a", "np.arc").replace("math.", "np.") for name, text in PYTHON.items()
-}
-"""Operations of formulas in numpy, whose numbers may be infinite."""
+} | {
+    "sigmoid": "0.5 + 0.5 * np.tanh(0.5 * {0})", "relu": "np.maximum({0}, 0.0)",
+    "softplus": "np.logaddexp({0}, 0.0)", "sign": "np.sign({0})",
+    "where": "np.where({0}, {1}, {2})", "maximum": "np.maximum({0}, {1})",
+    "minimum": "np.minimum({0}, {1})", "and": "np.logical_and({0}, {1})",
+    "or": "np.logical_or({0}, {1})", "not": "np.logical_not({0})",
+}  # fmt: skip
+"""Operations of formulas in numpy, whose numbers may be infinite; of numbers or of arrays."""
 
 
 def control_system(model: Model | LinearModel, name: str = "model") -> Any:
@@ -30,7 +35,7 @@ def control_system(model: Model | LinearModel, name: str = "model") -> Any:
         name: of the system.
 
     Raises:
-        ValueError: control is not installed, a static map of the user's own class, or a name that
+        ValueError: control is not installed, a static map without equations, or a name that
             is no identifier.
 
     Example:
@@ -57,7 +62,7 @@ def python_source(model: Model | LinearModel, name: str = "model") -> str:
         name: of the system.
 
     Raises:
-        ValueError: a static map of the user's own class, or a name that is no identifier.
+        ValueError: a static map without equations, or a name that is no identifier.
 
     Example:
         >>> made = {}
@@ -68,21 +73,10 @@ def python_source(model: Model | LinearModel, name: str = "model") -> str:
     """
     check_name(name)
     e = equations(model)
-    known = {
-        "name": name,
-        "about": e.about(name),
-        "rest": e.x_rest.size,
-        "arrays": _arrays(e),
-        "fs": float(e.fs),
-    }
-    if isinstance(e.static, Network):
-        known["value"] = e.static.sigma.numpy
-    elif isinstance(e.static, Formula):
-        z = [f"z[{i}]" for i in range(e.static.inputs)]
-        known["operations"], known["results"] = statements(e.static, z, _NUMPY)
-    sides = {"inputs": e.inputs, "outputs": e.outputs, "static": e.static}
-    known |= {"labels": {name: control_labels(sides[name]) for name in ("inputs", "outputs")}}
-    return rendered("model_py.txt", **known, **sides, **e.sizes, repr=repr)
+    sides = {"inputs": e.inputs, "outputs": e.outputs}
+    labels = {side: control_labels(channels) for side, channels in sides.items()}
+    known = {"about": e.about(name), "arrays": _arrays(e), "fs": float(e.fs), "labels": labels}
+    return e.rendered("model_py.txt", name, **known, **sides, statements=_statements, repr=repr)
 
 
 def _arrays(e: Equations) -> Iterator[tuple[str, str | list[str]]]:
@@ -90,5 +84,8 @@ def _arrays(e: Equations) -> Iterator[tuple[str, str | list[str]]]:
     for name, value in e.arrays.items():
         if value.size:
             yield name, str(value.tolist()) if value.ndim == 1 else [*map(str, value.tolist())]
-    if isinstance(e.static, Polynomial):
-        yield "growth", [*map(str, e.static.growth)]
+
+
+def _statements(formula: Formula, name: str) -> tuple[list[tuple[str, str]], list[str]]:
+    """Assignments of a formula of inputs called so, and its results."""
+    return statements(formula, [name.format(i) for i in range(formula.inputs)], _NUMPY)

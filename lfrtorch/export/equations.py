@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import keyword
 import re
-from collections.abc import Mapping, Sequence
-from copy import deepcopy
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any
@@ -19,26 +18,13 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.data_reach import DataReach
 from lfrtorch.engine.cell import Matrices
-from lfrtorch.engine.nonlinearity import Network, Polynomial, formula_of, known, known_parts
 from lfrtorch.engine.operating_point import double, equilibrium
-from lfrtorch.engine.operations import Formula
-from lfrtorch.engine.simulation import folded
 from lfrtorch.extended_kalman_filter import NoiseCovariance, data_root
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.maps.static_map import StaticMap
+from lfrtorch.maps.written import Written
 from lfrtorch.model import NO_OBSERVER, Model
 from lfrtorch.records import Channel
-
-
-@dataclass(frozen=True, eq=False)
-class Own:
-    """w = f(z) of a class of the user's own; the module is on the CPU in float64."""
-
-    module: Module
-
-    @property
-    def name(self) -> str:
-        """Its class."""
-        return type(self.module).__name__
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +41,9 @@ class Equations:
         matrices: A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw; nz = nw = 0 of a linear model.
         u_offset, y_offset: operating point.
         x_rest: state at rest under u_offset, (nx,); empty if none was found. x = 0 is near it.
-        static: f; None for a linear model.
-        weights: of f, by the names of its parameters.
+        map: f; nz = nw = 0 of a linear model.
+        written: f as the exports write it.
+        weights: the arrays of ``written``.
         fs: sampling frequency in Hz.
         inputs, outputs: channel names and units.
         reach: how far the data of the fit went; None if that is not known.
@@ -66,7 +53,8 @@ class Equations:
     u_offset: Array
     y_offset: Array
     x_rest: Array
-    static: Network | Polynomial | Own | Formula | None
+    map: StaticMap
+    written: Written
     weights: Mapping[str, Array]
     fs: float
     inputs: tuple[Channel, ...]
@@ -95,26 +83,17 @@ class Equations:
         """What a reader of the export should know: equations, channels, units, offsets, rate."""
         # ``place`` is how its language writes a channel: letter {0}, number from 0 {1} and from 1
         # {2}.
-        match self.static:
-            case Network(activation=name_of_sigma, sigma=sigma):
-                meaning = f", {sigma.meaning}" if sigma.meaning else ""
-                static = [f"w      = f(z) = Ww {name_of_sigma}(Wz z + bz) + bw{meaning}"]
-            case Polynomial():
-                static = ["w      = f(z) = C m, m = 1, z1, z2, .., z1 z1, z1 z2, .."]
-            case Own():
-                static = [f"w      = f(z), the map {printable(self.static.name)}"]
-            case Formula():
-                static = ["w      = f(z), a step of the known model and what is learned beside it"]
-            case None:
-                static = []
-        z, w, bw = (["z      = Cz x + Dzu v"], " + Dyw w", " + Bw w") if static else ([], "", "")
-        kind = "nonlinear" if static else "linear"
+        static, w, bw, kind = [], "", "", "linear"
+        if self.map.nw:
+            meaning = printable(self.map.meaning)
+            static = ["z      = Cz x + Dzu v", f"w      = f(z) = {meaning}"]
+            w, bw, kind = " + Dyw w", " + Bw w", "nonlinear"
         return [
             f"{name}: a {kind} state-space model in physical units, sampled at {self.fs:g} Hz,",
             f"by lfrtorch {version('lfrtorch')}.",
             "",
             "    v      = u - u_offset",
-            *(f"    {line}" for line in z + static),
+            *(f"    {line}" for line in static),
             f"    y      = Cy x + Dyu v{w} + y_offset",
             f"    x_next = A x + Bu v{bw}",
             "",
@@ -142,10 +121,23 @@ class Equations:
 
         None if it is not known, or the model is linear.
         """
-        if self.reach is None or self.static is None:
+        if self.reach is None or not self.map.nw:
             return None
         T = self.reach.z.axes / self.reach.z.farthest
         return T, T @ self.reach.z.middle
+
+    def rendered(self, template: str, name: str, **more: Any) -> str:
+        """A text of this room's folder ``templates`` for the model, and ``more`` that it has."""
+        import jinja2
+
+        environment = jinja2.Environment(
+            loader=jinja2.PackageLoader("lfrtorch.export"),
+            trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+        )  # fmt: skip
+        known = {"name": name, "NAME": name.upper(), "rest": self.x_rest.size, **self.sizes}
+        known |= {"map": self.map, "written": self.written, "weights": self.weights}
+        known |= {"feedthrough": self.feedthrough}
+        return environment.get_template(template).render(known | more)
 
 
 def _signals(
@@ -169,13 +161,21 @@ def printable(text: str) -> str:
     return "".join(sign if sign.isprintable() else " " for sign in text)
 
 
-def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
-    """The equations of a model; ``own`` lets a static map of the user's own class pass."""
+def equations(
+    model: Model | LinearModel, own: Callable[[Module, int], Written | None] = lambda *_: None
+) -> Equations:
+    """The equations of a model; ``own`` writes a static map of nz inputs that has none itself."""
     model = model.to_model() if isinstance(model, LinearModel) else model
-    cell, s = folded(model.lfr.cell), model.scaler
-    static = _static_map(cell.static, own)
-    listed = {} if cell.static is None or isinstance(static, Formula) else cell.static.state_dict()
-    weights = {name: w for name, w in listed.items() if not name.endswith("bounds")}
+    cell, s = double(model.lfr.cell), model.scaler
+    written = cell.map.written
+    if written is None and cell.static is not None:
+        written = own(cell.static, cell.nz)
+    if written is None:
+        raise InputError(
+            f"the static map is a {type(cell.static).__name__}, a class of your own, whose "
+            "equations are not known.\nA Network, a Polynomial, a known model or a StaticMap with "
+            "equations can be exported, and your class to onnx alone."
+        )
     M, y_scale = cell.matrices(), s.y_scale[:, None]
     found = Equations(
         matrices=M._replace(
@@ -185,34 +185,21 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
         u_offset=np.asarray(s.u_offset, dtype=np.float64),
         y_offset=np.asarray(s.y_offset, dtype=np.float64),
         x_rest=np.empty(0),
-        static=static,
-        weights={name: numbers(weight) for name, weight in weights.items()},
+        map=cell.map,
+        written=written,
+        weights={name: array.detach().numpy() for name, array in written.arrays.items()},
         fs=model.fs,
         inputs=model.inputs,
         outputs=model.outputs,
         reach=model.reach,
     )  # fmt: skip
-    parts = [*found.matrices, found.u_offset, found.y_offset, *found.weights.values()]
-    parts += [row.number for row in static.rows] if isinstance(static, Formula) else []
+    parts = [*found.matrices, found.u_offset, found.y_offset, numbers(cell.map.flat_weights())]
+    if written.formula is not None:
+        parts.append(np.array([row.number for row in written.formula.rows]))
     if not all(np.isfinite(part).all() for part in parts):
         raise InputError("the model has weights that are not finite; nothing can be exported.")
-    rest = equilibrium(double(cell), torch.zeros(cell.nu, dtype=torch.float64))
+    rest = equilibrium(cell, torch.zeros(cell.nu, dtype=torch.float64))
     return found if rest is None else replace(found, x_rest=numbers(rest))
-
-
-def _static_map(static: Module | None, own: bool) -> Network | Polynomial | Own | Formula | None:
-    """f, if its equations are known or it may be of the user's own class."""
-    if static is None or known(static) is not None:
-        return known(static)
-    if known_parts(static) is not None:
-        return formula_of(static)
-    if own:
-        return Own(deepcopy(static).to(device="cpu", dtype=torch.float64).eval())
-    raise InputError(
-        f"the static map is a {type(static).__name__}, a class of your own, whose equations are "
-        "not known.\nA Network, a Polynomial or a known model can be exported, and your class to "
-        "onnx alone."
-    )
 
 
 def numbers(weight: Tensor) -> Array:
@@ -248,17 +235,6 @@ def observer_equations(
     if model.K is None:
         raise InputError(NO_OBSERVER)
     return SteadyGain(np.ascontiguousarray(numbers(model.K) / model.scaler.y_scale))
-
-
-def rendered(template: str, **known: Any) -> str:
-    """A template of this room's folder ``templates``, filled."""
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("lfrtorch.export"),
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-    )  # fmt: skip
-    return environment.get_template(template).render(known)
 
 
 _RESERVED = {

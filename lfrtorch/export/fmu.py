@@ -15,7 +15,7 @@ import numpy as np
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.export.c_source import c_source
-from lfrtorch.export.equations import Equations, equations, printable, rendered
+from lfrtorch.export.equations import Equations, equations, printable
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
@@ -66,8 +66,8 @@ def write_fmu(
         version: 2 or 3, of FMI.
 
     Raises:
-        ValueError: no C compiler, another machine than Linux on x86_64, a static map of the user's
-            own class, or a name that is no identifier.
+        ValueError: no C compiler, another machine than Linux on x86_64, a static map
+            without equations, or a name that is no identifier.
 
     Example:
         >>> lfrtorch.export.write_fmu(model, "actuator.fmu", "actuator")
@@ -75,13 +75,12 @@ def write_fmu(
     header, source = c_source(model, name)
     e = equations(model)
     guid = str(uuid.uuid5(uuid.NAMESPACE_OID, header + source))
-    known = {"name": name, "NAME": name.upper(), "guid": guid, "version": version}
+    known = {"guid": guid, "version": version, "u_start": e.u_offset.tolist()}
     known |= {"others": _OTHERS[version], "unsupported": _UNSUPPORTED[version]}
-    known["u_start"] = e.u_offset.tolist()
     files = {
         f"{name}.h": header,
         f"{name}.c": source,
-        f"{name}_fmu.c": rendered("fmu.c", **known),
+        f"{name}_fmu.c": e.rendered("fmu.c", name, **known),
     }
     binary = _compiled(files, name)
     machine = "linux64" if version == 2 else "x86_64-linux"

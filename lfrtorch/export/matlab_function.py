@@ -8,16 +8,13 @@ import numpy as np
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.analysis.lpv_form import gauss_legendre, lpv
-from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.engine.operations import Formula
+from lfrtorch.analysis.lpv_form import lpv
 from lfrtorch.export.equations import (
     KalmanNoise,
     SteadyGain,
     check_name,
     equations,
     observer_equations,
-    rendered,
 )
 from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
@@ -50,7 +47,7 @@ def matlab_function(
         The texts of the functions by the names of their files, and the variables of ``NAME.mat``.
 
     Raises:
-        ValueError: a known model, a static map of the user's own class, a name that is no
+        ValueError: a static map that is no network and no polynomial, a name that is no
             identifier, or an observer that the model has not.
 
     Example:
@@ -65,8 +62,11 @@ def matlab_function(
     check_name(name)
     model = model.to_model() if isinstance(model, LinearModel) else model
     e = equations(model)
-    if isinstance(e.static, Formula):
-        raise InputError("a known model has no MATLAB code; export it to c, casadi, fmu or onnx.")
+    if e.map.nw and not e.weights:
+        raise InputError(
+            "this static map has no MATLAB code, which is made of arrays; export it to c, casadi, "
+            "control, fmu or onnx."
+        )
     form = lpv(model)
     literals = {n: w if w.ndim == 2 else w[:, None] for n, w in e.arrays.items()}
     found: dict[str, Any] = {}
@@ -74,14 +74,7 @@ def matlab_function(
     for side, channels in (("input", e.inputs), ("output", e.outputs)):
         found[f"{side}_names"] = np.array([c.name for c in channels], dtype=object)[:, None]
         found[f"{side}_units"] = np.array([c.unit for c in channels], dtype=object)[:, None]
-    known = {
-        "name": name,
-        "NAME": name.upper(),
-        "about": e.about(name, "{0}({2})"),
-        "static": e.static,
-        "rest": e.x_rest.size,
-        "feedthrough": e.feedthrough,
-    }
+    known: dict[str, Any] = {"about": e.about(name, "{0}({2})"), "schedule": form.schedule}
     match observer_equations(model, observer):
         case SteadyGain(K=K):
             known["K"], literals["K"] = True, K
@@ -90,31 +83,17 @@ def matlab_function(
             known["G"] = True
             literals |= {"Q": joint[ny:, ny:], "S": joint[ny:, :ny], "R": joint[:ny, :ny]}
             literals["P0"] = U @ U.T
-    match e.static:
-        case Network():
-            known["value"], known["slope"] = e.static.sigma.matlab
-            known["mean_slope"] = e.static.sigma.matlab_mean_slope
-        case Polynomial():
-            known["monomials"] = e.static.C.shape[1]
-            # Numbers of monomials and of z count from 1.
-            growth = [(m + 1.0, j + 1.0) for m, j in e.static.growth]
-            slopes = [
-                (n + 1.0, j + 1.0, float(times), m + 1.0) for n, j, times, m in e.static.slopes
-            ]
-            literals |= {"growth": np.array(growth), "slopes": np.array(slopes)}
     found["lpv"] = {letter: np.moveaxis(getattr(form, letter), 0, -1) for letter in "ABCD"}
     points = {"x0": form.x0, "u0": form.u0, "x_next0": form.x_next0, "y0": form.y0}
     found["lpv"] |= {letters: value[:, None] for letters, value in points.items()}
     found["lpv"] |= {"Cz": form.Cz, "Dzu": form.Dzu, "bounds": form.bounds}
-    if isinstance(e.static, Polynomial):
-        nodes = gauss_legendre(e.static)
-        found["lpv"] |= dict(zip(("nodes", "weights"), nodes, strict=True))
-    known |= e.sizes | {"schedule": form.schedule}
+    if e.weights and form.schedule == "map":
+        found["lpv"] |= {"nodes": e.map.quadrature.t, "weights": e.map.quadrature.weight}
     known["literals"] = [(n, _literal(w)) for n, w in literals.items()]
     templates = {"": "model.m", "_lpv": "model_lpv.m", "_numbers": "model_numbers.m"}
-    texts = {f"{name}{end}.m": rendered(file, **known) for end, file in templates.items()}
+    texts = {f"{name}{end}.m": e.rendered(file, name, **known) for end, file in templates.items()}
     for part in ("start", "correct", "advance") if observer is not False else ():
-        texts[f"{name}_{part}.m"] = rendered("model_observer.m", part=part, **known)
+        texts[f"{name}_{part}.m"] = e.rendered("model_observer.m", name, part=part, **known)
     return texts, found | literals
 
 

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping
 from functools import partial
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
+from torch.nn import Module
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
-from lfrtorch.engine.activations import Activation
-from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.engine.operations import Formula
-from lfrtorch.export.equations import Equations, Own, check_name, equations
+from lfrtorch.export.equations import Equations, check_name, equations
 from lfrtorch.export.traced_map import IR, OPSET, traced
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.maps.operations import Formula
+from lfrtorch.maps.written import Written
 from lfrtorch.model import Model
 
 
@@ -38,15 +38,14 @@ def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, A
         sample: x (n, nx), u (n, nu) -> x_next (n, nx), y (n, ny);
         simulation: x0 (n, nx), u (n, T, nu) -> x_end (n, nx), y (n, T, ny).
 
-    A static map of the user's own class goes through ``torch.onnx.export``, which traces its
-    ``forward``.
+    A static map without equations goes through ``torch.onnx.export``, which traces its ``forward``.
 
     Returns:
         Two ``onnx.ModelProto``.
 
     Raises:
-        ValueError: onnx is not installed, a static map of the user's own class that cannot be
-            traced, or a name that is no identifier.
+        ValueError: onnx is not installed, a static map without equations that cannot be traced, or
+            a name that is no identifier.
 
     Example:
         >>> sample, simulation = lfrtorch.export.onnx_models(model, "actuator")
@@ -54,10 +53,20 @@ def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, A
         (['x', 'u'], ['x_end', 'y'])
     """
     check_name(name)
-    e, graph = equations(model, own=True), Graph(imported("onnx", "onnx"))
+    e = equations(model, _own)
+    graph = Graph(imported("onnx", "onnx"), e.arrays)
     _sample(e, graph)
     sample, simulation = graph.sample(e, name), graph.simulation(e, name)
     return graph.model(sample, e, name), graph.model(simulation, e, name)
+
+
+def _own(static: Module, nz: int) -> Written:
+    """A map without equations, traced."""
+
+    def of(graph: Any, z: str) -> str:
+        return graph.spliced(traced(static, nz), "f_", z)
+
+    return Written("", {}, of)
 
 
 def _sample(e: Equations, graph: Graph) -> None:
@@ -66,48 +75,15 @@ def _sample(e: Equations, graph: Graph) -> None:
 
     def combined(to: str, matrices: dict[str, str], *offset: str) -> str:
         """Sum of matrices times signals, which are rows, and perhaps an offset."""
-        terms = [
-            graph.node("MatMul", signal, graph.constant(letters, e.arrays[letters].T))
-            for letters, signal in matrices.items()
-        ]
+        terms = [graph.product(letters, signal) for letters, signal in matrices.items()]
         return graph.node("Sum", *terms, *offset, to=to)
 
     x_next, y = {"A": "x", "Bu": v}, {"Cy": "x", "Dyu": v}
-    if e.static is not None:
-        w = z = combined("z", {"Cz": "x", "Dzu": v})
-        match e.static:
-            case Network():
-                w = _network(graph, e, e.static.sigma, z)
-            case Polynomial():
-                w = _polynomial(graph, e, e.static.growth, z)
-            case Formula():
-                w = _formula(graph, e.static, z)
-            case Own():
-                w = graph.spliced(traced(e.static, e.sizes["nz"]), "f_", z)
+    if e.map.nw:
+        w = e.written.of(graph, combined("z", {"Cz": "x", "Dzu": v}))
         x_next["Bw"], y["Dyw"] = w, w
     combined("x_next", x_next)
     combined("y", y, graph.constant("y_offset", e.y_offset))
-
-
-def _network(graph: Graph, e: Equations, sigma: Activation, z: str) -> str:
-    """w = Ww h + bw with h = σ(Wz z + bz)."""
-
-    def affine(W: str, b: str, signal: str) -> str:
-        product = graph.node("MatMul", signal, graph.constant(W, e.weights[W].T))
-        return graph.node("Add", product, graph.constant(b, e.weights[b]))
-
-    return affine("Ww", "bw", sigma.onnx(graph, affine("Wz", "bz", z)))
-
-
-def _polynomial(graph: Graph, e: Equations, growth: Sequence[tuple[int, int]], z: str) -> str:
-    """w = C m; the constant monomial is a bias."""
-    C, m = e.weights["C"], [""]
-    each = graph.split("Split", z, to=[f"z{j}" for j in range(e.sizes["nz"])], axis=-1)
-    for before, j in growth:
-        m.append(graph.node("Mul", m[before], each[j]) if before else each[j])
-    products = graph.node("Concat", *m[1:], axis=-1)
-    w = graph.node("MatMul", products, graph.constant("C", C[:, 1:].T))
-    return graph.node("Add", w, graph.constant("c", C[:, 0]))
 
 
 _NAMES = {
@@ -123,33 +99,57 @@ _NAMES = {
 """Operations of formulas as operators."""
 
 
-def _formula(graph: Graph, formula: Formula, z: str) -> str:
-    """w of a table of operations, on columns."""
-    if any(row.name == "atan2" for row in formula.rows):
-        raise InputError("ONNX has no operator for atan2, which the known model calls; use atan.")
-
-    def constant(value: float) -> str:
-        return graph.constant(f"number_{value!r}", np.array([[value]]))
-
-    def softplus(v: str) -> str:
-        near = graph.node("Exp", graph.node("Neg", graph.node("Abs", v)))
-        rest = graph.node("Log", graph.node("Add", near, constant(1.0)))
-        return graph.node("Add", graph.node("Relu", v), rest)
-
-    each = graph.split("Split", z, to=[f"z{j}" for j in range(formula.inputs)], axis=-1)
-    apply: dict[str, Any] = {name: partial(graph.node, own) for name, own in _NAMES.items()}
-    results = formula.evaluated(each, {**apply, "softplus": softplus}, constant)
-    nothing = graph.node("Mul", each[0], constant(0.0))  # a result may be a constant
-    return graph.node("Concat", *(graph.node("Add", w, nothing) for w in results), axis=-1)
-
-
 class Graph:
     """Nodes and constants that become a model of ONNX."""
 
-    def __init__(self, onnx: Any) -> None:
-        self.onnx = onnx
+    def __init__(self, onnx: Any, arrays: Mapping[str, Array]) -> None:
+        self.onnx, self.arrays = onnx, arrays
         self.nodes: list[Any] = []
         self.constants: dict[str, Any] = {}
+
+    def product(self, M: str, signal: str) -> str:
+        """An array times a signal, which is a row."""
+        return self.node("MatMul", signal, self.constant(M, self.arrays[M].T))
+
+    def affine(self, W: str, v: str, b: str = "") -> str:
+        """W v + b."""
+        found = self.product(W, v)
+        return self.node("Add", found, self.constant(b, self.arrays[b])) if b else found
+
+    def each(self, sigma: Formula, v: str) -> str:
+        """A function of one number, of every entry of v."""
+        return self.evaluated(sigma, [v])[0]
+
+    def table(self, formula: Formula, v: str) -> str:
+        """A function of the entries of v."""
+        entries = self.split("Split", v, to=[f"z{j}" for j in range(formula.inputs)], axis=-1)
+        nothing = self.node("Mul", entries[0], self.number(0.0))
+        varying: set[int] = set()  # the rows that are no constants, which are shorter
+        for place, row in enumerate(formula.rows):
+            if row.name == "input" or varying.intersection(row.operands):
+                varying.add(place)
+        results = [
+            w if place in varying else self.node("Add", w, nothing)
+            for w, place in zip(self.evaluated(formula, entries), formula.results, strict=True)
+        ]
+        return self.node("Concat", *results, axis=-1)
+
+    def evaluated(self, formula: Formula, v: list[str]) -> list[str]:
+        """The results of a table of operations on columns or on rows."""
+        if any(row.name == "atan2" for row in formula.rows):
+            raise InputError("ONNX has no operator for atan2, which the map calls; use atan.")
+
+        def softplus(v: str) -> str:  # the operator has no float64 in every runtime
+            near = self.node("Exp", self.node("Neg", self.node("Abs", v)))
+            rest = self.node("Log", self.node("Add", near, self.number(1.0)))
+            return self.node("Add", self.node("Relu", v), rest)
+
+        apply: dict[str, Any] = {name: partial(self.node, own) for name, own in _NAMES.items()}
+        return formula.evaluated(v, {**apply, "softplus": softplus}, self.number)
+
+    def number(self, value: float) -> str:
+        """Keep a number as a constant; its name."""
+        return self.constant(f"number_{value!r}", np.array([[value]]))
 
     def constant(self, name: str, value: Array) -> str:
         """Keep a constant; its name."""

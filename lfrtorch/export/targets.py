@@ -188,9 +188,9 @@ def write(
 
     Raises:
         ValueError: an unknown target, one whose package is not installed, a name that is no
-            identifier, a file that exists, the folder of a checkpoint, a static map of the user's
-            own class, an observer that the target or the model has not, or a disturbance without
-            noise for the filter.
+            identifier, a file that exists, the folder of a checkpoint, a static map
+            without equations, an observer that the target or the model has not, or a disturbance
+            without noise for the filter.
 
     Example:
         >>> [path.name for path in lfrtorch.export.write(model, "c", "made", name="actuator")]

@@ -1,18 +1,19 @@
-"""A static map of the user's own class as a graph of ONNX, which is compared with the map."""
+"""A static map without equations as a graph of ONNX, which is compared with the map."""
 
 from __future__ import annotations
 
 import inspect
 import io
 import warnings
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 import torch
+from torch.nn import Module
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.optional import imported
-from lfrtorch.export.equations import Own
 
 OPSET, IR = 17, 8
 """Operators and file format of 2022, which every runtime since then reads."""
@@ -21,11 +22,12 @@ _SAMPLES = (1, 5, 64)
 """Numbers of inputs on which graph and map are compared."""
 
 
-def traced(static: Own, nz: int) -> Any:
+def traced(static: Module, nz: int) -> Any:
     """The graph z (n, nz) -> w (n, nw) of a map; refuse a map that it does not compute."""
     onnx = imported("onnx", "onnx")
     generator = torch.Generator().manual_seed(0)
     file: Any = io.BytesIO()  # which it takes, whatever its types say
+    static = deepcopy(static).eval()
     z = torch.randn(max(_SAMPLES), nz, generator=generator, dtype=torch.float64)
     # Since torch 2.9 another exporter is the default, which needs one package more.
     older: dict[str, Any]
@@ -34,7 +36,7 @@ def traced(static: Own, nz: int) -> Any:
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             torch.onnx.export(
-                static.module, (z,), file, input_names=["z"], output_names=["w"],
+                static, (z,), file, input_names=["z"], output_names=["w"],
                 opset_version=OPSET, dynamic_axes={"z": {0: "n"}, "w": {0: "n"}}, **older,
             )  # fmt: skip
     except Exception as error:  # of many classes, by what its forward does
@@ -47,7 +49,7 @@ def traced(static: Own, nz: int) -> Any:
     for scale, count in zip(np.linspace(3.0, 0.0, len(_SAMPLES) + 1), _SAMPLES, strict=False):
         point = float(scale) * z[:count]
         with torch.no_grad():
-            expected = static.module(point).numpy()
+            expected = static(point).numpy()
         (found,) = run(None, {"z": point.numpy()})
         size = max(1.0, np.abs(np.nan_to_num(expected)).max())
         # Largest error of the graph, relative to 1 and to the largest w.
@@ -62,8 +64,8 @@ def traced(static: Own, nz: int) -> Any:
     return model
 
 
-def _refused(static: Own, why: str) -> InputError:
+def _refused(static: Module, why: str) -> InputError:
     return InputError(
-        f"the static map {static.name}, a class of your own, has no graph of ONNX: its forward "
-        f"must be made of torch's functions.\n{why}"
+        f"the static map {type(static).__name__}, a class of your own, has no graph of ONNX: its "
+        f"forward must be made of torch's functions.\n{why}"
     )

@@ -55,6 +55,7 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.least_squares.simulation_errors import SimulationErrors
+from lfrtorch.least_squares.term import Seen
 from lfrtorch.linear.bla import refined_near
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -522,16 +523,18 @@ class _Study:
             return
         theta = problem.theta
         # Start states at one ridge are near those at the next.
-        judges = dict[int, SimulationErrors]()
+        judges = dict[int, tuple[SimulationErrors, Seen | None]]()
 
         def simulated(record: Record) -> Array:
             if id(record) not in judges:
                 own = [model.scaler.normalise(record)]
-                judges[id(record)] = SimulationErrors(
-                    model.lfr.cell, own, Ranks(), solve_initial_states=True
-                )
-            judge = judges[id(record)]
-            y = judge.trajectories(theta[: judge.parameters.own])[0].y[0]
+                cell = model.lfr.cell
+                judge = SimulationErrors(cell, own, Ranks(), solve_initial_states=True)
+                judges[id(record)] = judge, None
+            judge, near = judges[id(record)]
+            _, seen = judge.evaluate(theta[: judge.parameters.own], near)
+            judges[id(record)] = judge, seen
+            y = seen[0].y[0]
             return record.shown(model.scaler.restore_y(y.double().numpy()))
 
         for ridge, iterations in self._ridges:

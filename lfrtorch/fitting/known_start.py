@@ -20,10 +20,7 @@ from torch import Tensor
 from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch._support.tables import number, quantity
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.direct_sum import DirectSum
-from lfrtorch.engine.known_map import KnownMap
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network, Polynomial, known_parts
 from lfrtorch.fitting.driven_states import relaxation_frequencies
 from lfrtorch.fitting.from_outputs import begins_at_outputs, begun_on_short_windows, in_windows
 from lfrtorch.fitting.multistart import fit
@@ -33,6 +30,11 @@ from lfrtorch.fitting.trainer import StartDivergesError, StoppedError
 from lfrtorch.known import Known
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.maps.direct_sum import DirectSum
+from lfrtorch.maps.known_map import KnownModel
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.polynomial import Polynomial
+from lfrtorch.maps.static_map import StaticMap
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler, common_unit, rms_scale
 
@@ -78,26 +80,26 @@ def known_model(known: Known, linear: LinearModel, records: Sequence[Record]) ->
 
 
 def around(
-    static: KnownMap,
+    static: KnownModel,
     known: Known,
     nu: int,
     ny: int,
     *,
-    learned: Network | Polynomial | None = None,
-    nz: int = 0,
-    nw: int = 0,
+    learned: StaticMap | None = None,
     states: int = 0,
 ) -> LFRCell:
     """The cell around a known model and, beside it, a learned map and learned states; all at 0."""
-    whole, nx, names = static, len(known.states), [state.name for state in known.states]
-    if learned is not None:
-        whole = DirectSum([static, learned], [(static.nz, static.nw), (nz, nw)])
-    sizes = nu, ny, nx + states, static.nz + nz, static.nw + nw
-    cell = LFRCell(*sizes, whole, dtype=static.p.dtype, device=static.p.device, random=False)
+    nx, names = len(known.states), [state.name for state in known.states]
+    parts = [static] if learned is None else [static, learned]
+    sizes = [(part.nz, part.nw) for part in parts]
+    nz, nw = map(sum, zip(*sizes, strict=True))
+    whole = static if learned is None else DirectSum(parts, sizes)
+    like: dict[str, Any] = {"dtype": static.p.dtype, "device": static.p.device}
+    cell = LFRCell(nu, ny, nx + states, nz, nw, whole, **like, random=False)
     with torch.no_grad():
         cell.Cz[:nx, :nx], cell.Dzu[nx : nx + nu] = torch.eye(nx), torch.eye(nu)
         cell.Bw[:nx, :nx], cell.Dyw[:, nx : nx + ny] = torch.eye(nx), torch.eye(ny)
-    x, z, w = (torch.arange(n) for n in (nx + states, static.nz + nz, static.nw + nw))
+    x, z, w = (torch.arange(n) for n in (nx + states, nz, nw))
     own_x, own_z, own_w = x < nx, z < static.nz, w < static.nw
 
     def not_among(some: Sequence[str]) -> Tensor:  # known states that are not
@@ -122,14 +124,11 @@ def around(
 
 def with_learned(model: Model, records: Sequence[Record], settings: Settings, seed: int) -> Model:
     """A known model with what is to be learned beside it, which is zero still."""
-    parts = known_parts(model.lfr.cell.static)
-    assert parts is not None
-    static, old = deepcopy(parts[0]), model.lfr.cell
+    old, static = model.lfr.cell, deepcopy(model.lfr.cell.map.known)
     known, nx, states = cast(Known, settings.known), old.nx, cast(int, settings.nx)
     generator = torch.Generator().manual_seed(seed)
     learned = learned_map(settings, generator)
-    nz, nw = (0, 0) if learned is None else (cast(int, settings.nz), cast(int, settings.nw))
-    cell = around(static, known, old.nu, old.ny, learned=learned, nz=nz, nw=nw, states=states)
+    cell = around(static, known, old.nu, old.ny, learned=learned, states=states)
 
     def uniform(name: str, part: Any, limit: float = 1.0) -> None:
         entries = cell.get_parameter(name)[part]
@@ -157,12 +156,11 @@ def with_learned(model: Model, records: Sequence[Record], settings: Settings, se
             cell.Dzu[own_z] /= rms[:, None]
             uniform("Bw", (slice(None), own_w), _REACH)
             uniform("Dyw", (slice(None), own_w), _REACH)
-            for name in ("Ww", "bw") if isinstance(learned, Network) else ("C",):
-                learned.get_parameter(name).zero_()
+            learned.zero_output()
     return replace(model, lfr=LFR(cell))
 
 
-def learned_map(settings: Settings, generator: torch.Generator) -> Network | Polynomial | None:
+def learned_map(settings: Settings, generator: torch.Generator) -> StaticMap | None:
     """The map that is learned beside a known model; None if none is asked for."""
     nz, nw, nn = (cast(int, size) for size in (settings.nz, settings.nw, settings.nn))
     if settings.static == "polynomial":
@@ -177,10 +175,8 @@ def learned_map(settings: Settings, generator: torch.Generator) -> Network | Pol
 def varied(model: Model, seed: int) -> Model:
     """The known model with other parameters: within the bounds, and else by a random factor."""
     found = deepcopy(model)
-    parts = known_parts(found.lfr.cell.static)
-    assert parts is not None
-    static, random = parts[0], np.random.default_rng(seed)
-    low, high = (static.bounds / static.p_scale[:, None]).numpy().T
+    static, random = found.lfr.cell.map.known, np.random.default_rng(seed)
+    low, high = static.weight_bounds.numpy().T
     p = static.p.detach().numpy().copy()
     shifted = np.where(p == 0.0, _SPREAD * random.standard_normal(len(p)), p)
     p = np.where(p == 0.0, shifted, p * np.exp(_SPREAD * random.standard_normal(len(p))))
@@ -254,5 +250,5 @@ def known_starts(stage: Stage, linear: LinearModel) -> tuple[Settings, list[Mode
 
 def physical(model: Model) -> dict[str, float]:
     """The parameters of a known model in their units; none of another model."""
-    parts = known_parts(model.lfr.cell.static)
-    return {} if parts is None else parts[0].physical
+    known = model.lfr.cell.map.known
+    return {} if known is None else known.physical

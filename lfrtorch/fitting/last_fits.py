@@ -54,7 +54,7 @@ def distilled(stage: Stage, result: FitResult) -> FitResult:
         return one
     judged = dataset.validation or dataset.train
     problems = [Problem.judge(m, judged) for m in (one.model, result.model)]
-    costs = [problem.cost(problem.residual(problem.theta)) for problem in problems]
+    costs = [problem.evaluate(problem.theta).cost for problem in problems]
     found, mean = stage.ranks.first(torch.tensor(costs, dtype=torch.float64)).sqrt().tolist()
     taken = found <= AS_GOOD * mean or not dataset.validation
     on = "validation" if dataset.validation else "training"
@@ -76,7 +76,7 @@ def without_poor_starts(stage: Stage, result: FitResult) -> FitResult:
     models, train = predicting(members, train) if predicts else (members, train)
     assert isinstance(models, list)
     judges = [Problem.judge(model, train) for model in models]
-    costs = torch.tensor([j.cost(j.residual(j.theta)) for j in judges], dtype=torch.float64)
+    costs = torch.tensor([j.evaluate(j.theta).cost for j in judges], dtype=torch.float64)
     costs = stage.ranks.first(costs.nan_to_num(torch.inf))  # the simulation of some may run away
     near = int((costs <= _POOR**2 * costs.min()).sum())
     if near == len(result.members):

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import Module
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network, is_network
+from lfrtorch.maps.direct_sum import DirectSum
 from lfrtorch.model import Model
 
 
@@ -22,14 +24,14 @@ def mean_model(models: Sequence[Model]) -> Model:
     """The model whose output is the mean of the outputs of several models.
 
     Models that fit alike from different random starts differ in what the data do not tell. There
-    the squared error of their mean is at most the mean of theirs. It has the states, z, w and
-    neurons of all: A, Bw, Cz, Wz and Ww are block diagonal.
+    the squared error of their mean is at most the mean of theirs. It has the states, z and w of
+    all, and their static maps beside each other: networks of the same activation are one network.
 
     Args:
-        models: of the same data, each with a network of the same activation; they are copied.
+        models: of the same data; they are copied.
 
     Raises:
-        ValueError: no model, or models of other channels, scales, rates or static maps.
+        ValueError: no model, models of other channels, scales or rates, or a known model.
 
     Example:
         >>> models = [lfrtorch.initialise(bla, record, nz=1, nw=1, nn=4, seed=i) for i in range(3)]
@@ -39,23 +41,16 @@ def mean_model(models: Sequence[Model]) -> Model:
     if not models:
         raise InputError("there is no model to average; give one or more.")
     first = models[0]
-    cells, networks = [], []
-    for model in models:
-        static = model.lfr.cell.static
-        if not is_network(static):
-            raise InputError(
-                f"the mean is of models with a network, and one of these has {static!r} as its "
-                "static nonlinearity; average the simulated outputs instead."
-            )
-        if networks and static.activation != networks[0].activation:
-            raise InputError("the models have networks of different activations; give one kind.")
-        if not _alike(model, first):
-            raise InputError(
-                "the models have other channels, scales or rates than each other; give models "
-                "that start from the same linear model and data."
-            )
-        cells.append(model.lfr.cell)
-        networks.append(static)
+    if not all(_alike(model, first) for model in models):
+        raise InputError(
+            "the models have other channels, scales or rates than each other; give models that "
+            "start from the same linear model and data."
+        )
+    if any(model.known_states for model in models):
+        raise InputError(
+            "a mean of known models has no parameters of its own; average the simulated outputs."
+        )
+    cells = [model.lfr.cell for model in models]
     count = len(cells)
 
     def blocks(of: Callable[[LFRCell], Tensor]) -> Tensor:
@@ -68,10 +63,8 @@ def mean_model(models: Sequence[Model]) -> Model:
         return torch.cat([of(cell) for cell in cells], dim=1) / count
 
     nx, nz, nw = (sum(getattr(cell, n) for cell in cells) for n in ("nx", "nz", "nw"))
-    nn = sum(len(network.bz) for network in networks)
     like = {"device": cells[0].A.device, "dtype": cells[0].A.dtype}
-    network = Network(nz, nw, nn, networks[0].activation, **like)
-    cell = LFRCell(cells[0].nu, cells[0].ny, nx, nz, nw, network, **like, random=False)
+    cell = LFRCell(cells[0].nu, cells[0].ny, nx, nz, nw, _beside(cells), **like, random=False)
     with torch.no_grad():
         cell.A.copy_(blocks(lambda c: c.A))
         cell.Bw.copy_(blocks(lambda c: c.Bw))
@@ -81,13 +74,20 @@ def mean_model(models: Sequence[Model]) -> Model:
         cell.Cy.copy_(beside(lambda c: c.Cy))
         cell.Dyw.copy_(beside(lambda c: c.Dyw))
         cell.Dyu.copy_(torch.stack([c.Dyu for c in cells]).mean(dim=0))
-        for name, weight in network.named_parameters():
-            parts = [n.get_parameter(name) for n in networks]
-            weight.copy_(torch.block_diag(*parts) if weight.ndim == 2 else torch.cat(parts))
     cell.free_feedthrough(
         z=any(c.Dzu.requires_grad for c in cells), y=any(c.Dyu.requires_grad for c in cells)
     )
     return replace(first, lfr=LFR(cell), K=None)  # gains of models do not make one of their mean
+
+
+def _beside(cells: Sequence[LFRCell]) -> Module | None:
+    """The static maps of all cells as one."""
+    cells = [cell for cell in cells if cell.nw]
+    if not cells:
+        return None
+    first, *others = (cell.map for cell in cells)
+    parts = [deepcopy(cell.static) for cell in cells if cell.static is not None]
+    return first.beside(others) or DirectSum(parts, [(cell.nz, cell.nw) for cell in cells])
 
 
 def _alike(one: Model, other: Model) -> bool:

@@ -39,7 +39,6 @@ from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.analysis.static_slopes import infinite_slope
 from lfrtorch.distributed import Ranks
-from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.forgetting import forgets
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
@@ -166,7 +165,7 @@ def fit(
     Raises:
         ValueError: no model, none that is stable on the training records at the start, validation
             records that all have too few samples, fewer starts and records than processes,
-            another number of lists of monitors, models to average that have no network, or another
+            another number of lists of monitors, known models or structures to average, or another
             ``noise`` than ``"output"`` and a trainer with a ``guarantee``.
         ProcessLostError, StoppedError: before there was an iterate to keep.
 
@@ -338,12 +337,8 @@ def _check(starts: Sequence[Model], watching: Sequence[Sequence[Monitor]], avera
         )
     integer("average", average, 1)
     for model in starts:
-        refuse_together(average=average, structure=model.lfr.cell.structure)
-    if average > 1 and not all(is_network(model.lfr.cell.static) for model in starts):
-        raise InputError(
-            f"average is {average}, and the mean is of models with a network as their static "
-            "nonlinearity; give average=1 for other maps."
-        )
+        known = "given" if model.known_states else None
+        refuse_together(average=average, structure=model.lfr.cell.structure, known=known)
 
 
 def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]:
@@ -414,7 +409,7 @@ class _Judge:
         found = []
         for fit in fits:
             error, best = self._errors.get(id(fit)), fit.kept
-            selection = math.nan if error is None else error.rmse(error.theta)
+            selection = math.nan if error is None else error.rmse(error.read())
             number, last, why = self.numbers[id(fit)], fit.history[-1], told(fit.reason, fit.detail)
             found.append(
                 RestartSummary(number, last.iteration, best.train, best.validation, selection, why)
@@ -458,7 +453,7 @@ class _Judge:
 
 
 def _cost(error: Problem) -> float:
-    return error.cost(error.residual(error.theta))
+    return error.evaluate(error.read()).cost
 
 
 def _drop_others(field: list[Fit], kept: list[Fit]) -> list[Fit]:

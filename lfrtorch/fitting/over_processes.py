@@ -15,7 +15,6 @@ from tempfile import TemporaryDirectory
 from threading import Event
 
 import torch
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch._support.reasons import Reason
 from lfrtorch.distributed import ProcessLostError, Ranks
@@ -33,9 +32,10 @@ Take = Callable[[int, bytes], None]
 
 def same_weights(models: Sequence[Model], ranks: Ranks) -> None:
     """Give all processes the weights of the first one's models."""
-    for model in models:
-        weights = ranks.first(parameters_to_vector(model.lfr.parameters()))
-        vector_to_parameters(weights, model.lfr.parameters())
+    with torch.no_grad():
+        for model in models if ranks.world > 1 else ():
+            for p in model.lfr.parameters():
+                p.copy_(ranks.first(p.detach()))
 
 
 class OverProcesses(Together):

@@ -16,13 +16,13 @@ from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.settings import check_settings, documented, setting
 from lfrtorch.engine.cell import check_dtype
-from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.exclusions import USUAL, refuse_together
 from lfrtorch.fitting.plain_settings import PlainSettings, Size
 from lfrtorch.fitting.trainer import Trainer
 from lfrtorch.known import Known
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.model import Model
 
 LAST_SIZE = {"network": "nn", "polynomial": "degree"}

@@ -17,7 +17,6 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
 from lfrtorch.engine.cell import LFRCell, check_dtype
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.fitting.driven_states import (
     distortion_frequencies,
     relaxation_frequencies,
@@ -29,6 +28,7 @@ from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.modes import without_slow_minor_modes
+from lfrtorch.maps.network import Network
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
 
@@ -37,9 +37,6 @@ _OUTPUT_RANGE = 0.3
 
 _RUNAWAY = 1e38
 """Normalised states whose eighth power, in polynomials, is still a number."""
-
-_OUTPUT_WEIGHTS: dict[type[Module], tuple[str, ...]] = {Network: ("Ww", "bw"), Polynomial: ("C",)}
-"""The weights of a static map that make its output vanish."""
 
 
 @typed("dtype")
@@ -228,8 +225,8 @@ def initialise(
         spread = _deviation(z)[:, None]
         cell.Cz.div_(spread)
         cell.Dzu.div_(spread)
-        for name in _OUTPUT_WEIGHTS.get(type(static), ()) if method == "zero_output" else ():
-            static.get_parameter(name).zero_()
+        if method == "zero_output":
+            cell.map.zero_output()
         if method == "zero_output" and not static((z / spread.mT).unsqueeze(0)).any():
             to_output = feedthrough or not z_feedthrough
             uniform(cell.Bw, 0.0 if end == "output" and to_output else _OUTPUT_RANGE)

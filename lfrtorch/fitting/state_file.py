@@ -7,7 +7,7 @@ same fit reads it again.
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,7 +21,7 @@ State = TypeVar("State")
 Tensors = dict[str, Tensor]
 Numbers = dict[str, Any]
 
-_FORMAT = "lfrtorch snapshot 2"
+_FORMAT = "lfrtorch snapshot 3"
 
 
 def write(path: Path, numbers: Numbers, tensors: Tensors) -> None:
@@ -51,25 +51,40 @@ def packed(state: Any) -> tuple[Numbers, Tensors]:
     """Return numbers and texts of a dataclass, and tensors as state.name or state.name.key."""
     numbers: Numbers = {}
     tensors: Tensors = {}
-    for name, value in vars(state).items():
-        if isinstance(value, Tensor):
-            tensors[f"state.{name}"] = value
-        elif isinstance(value, dict):
-            tensors |= {f"state.{name}.{key}": tensor for key, tensor in value.items()}
+    for field in fields(state):
+        value = getattr(state, field.name)
+        if isinstance(value, Tensor | dict | tuple):
+            tensors |= leaves(value, f"state.{field.name}")
         else:
-            numbers[name] = value
+            numbers[field.name] = value
     return numbers, tensors
+
+
+def leaves(value: Any, name: str) -> Tensors:
+    """Return the tensors in dictionaries and tuples, by name and key or place."""
+    if isinstance(value, Tensor):
+        return {name: value}
+    keyed = value.items() if isinstance(value, dict) else enumerate(value)
+    return {n: t for key, part in keyed for n, t in leaves(part, f"{name}.{key}").items()}
+
+
+def refilled(like: Any, name: str, tensors: Tensors) -> Any:
+    """Return what ``leaves`` took apart; tuples are as many and of the kinds that ``like`` has."""
+    if isinstance(like, Tensor):
+        return tensors[name]
+    if isinstance(like, dict):
+        return within(f"{name}.", tensors)
+    parts = [refilled(part, f"{name}.{i}", tensors) for i, part in enumerate(like)]
+    return type(like)(*parts) if hasattr(like, "_fields") else tuple(parts)
 
 
 def unpacked(like: State, numbers: Numbers, tensors: Tensors) -> State:
     """Return a dataclass like the given one with the fields that were packed."""
     values: Numbers = dict(numbers)
-    for name, tensor in within("state.", tensors).items():
-        field, _, key = name.partition(".")
-        if key:
-            values.setdefault(field, {})[key] = tensor
-        else:
-            values[field] = tensor
+    for field in fields(like):  # pyright: ignore[reportArgumentType]
+        value = getattr(like, field.name)
+        if isinstance(value, Tensor | dict | tuple):
+            values[field.name] = refilled(value, f"state.{field.name}", tensors)
     return replace(like, **values)  # pyright: ignore[reportArgumentType]
 
 

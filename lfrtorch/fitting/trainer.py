@@ -13,7 +13,6 @@ from typing import Any, Protocol, Self
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch._support.errors import InputError, LfrtorchError
 from lfrtorch._support.reasons import Reason, told
@@ -23,7 +22,7 @@ from lfrtorch.fitting import state_file
 from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.windows import windows
 from lfrtorch.least_squares.guarantee import Name
-from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, Point
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.model import Model
@@ -40,37 +39,12 @@ class StartDivergesError(InputError):
     """All models diverge on the training records at the start."""
 
 
-class TrainerState(Protocol):
-    """What the loop reads of a trainer's state."""
-
-    @property
-    def theta(self) -> Tensor:
-        """Parameters (P,)."""
-        ...
-
-    @property
-    def residual(self) -> Tensor:
-        """r (M,) at θ."""
-        ...
-
-    @property
-    def iteration(self) -> int:
-        """Steps so far."""
-        ...
-
-    @property
-    def reason(self) -> str:
-        """Why the search is over; empty while it is not."""
-        ...
-
-    @property
-    def report(self) -> dict[str, float]:
-        """Scalars of the last step, for the monitors."""
-        ...
-
-
 class Trainer(Protocol):
-    """A search in steps: Levenberg-Marquardt or Adam."""
+    """A search in steps: Levenberg-Marquardt or Adam.
+
+    Its states are values: ``point`` (θ and what the problem found there), ``iteration``, ``reason``
+    (empty while it goes on), and ``report``, scalars of the last step for monitors.
+    """
 
     @property
     def limit(self) -> int:
@@ -253,9 +227,9 @@ class Fit:
         self.model, self.keep, self._stop = model, keep, stop
         self.trainer = LevenbergMarquardt() if trainer is None else trainer
         self.ranks = ranks = Ranks() if ranks is None else ranks
-        if ranks.world > 1:
-            weights = parameters_to_vector(model.lfr.parameters())
-            vector_to_parameters(ranks.first(weights), model.lfr.parameters())
+        with torch.no_grad():
+            for p in model.lfr.parameters() if ranks.world > 1 else ():
+                p.copy_(ranks.first(p.detach()))
         guarantee = self.trainer.guarantee
         refuse_together(structure=model.lfr.cell.structure, guarantee=guarantee)
         longest = max(record.samples for record in as_records(train))
@@ -277,6 +251,7 @@ class Fit:
                 ranks=ranks,
             )
         self.judge = self.judge_of(model, validation) if validation else None
+        self._judged: Point | None = None  # the latest iterate, as the judge sees it
         self.state: Any = None
         """The trainer's; None before the first call of ``advance``."""
         self.history: list[Progress] = []
@@ -287,7 +262,7 @@ class Fit:
         self._first = self._score = math.inf
         self._seconds = 0.0
         self._durations: list[float] = []
-        if not math.isfinite(self.problem.cost(self.problem.residual(self.problem.theta))):
+        if not math.isfinite(self.problem.evaluate(self.problem.theta).cost):
             self.note_end(Reason.START_DIVERGES)
             self.history.append(
                 Progress(0, self.trainer.limit, math.inf, math.nan, 0.0, False, {}, math.inf)
@@ -369,9 +344,8 @@ class Fit:
         state, tensors = state_file.packed(self.state)
         problem = self.problem.state_dict()
         tensors |= {f"problem.{name}": tensor for name, tensor in problem.items()}
-        if self.judge is not None:
-            judge = self.judge.state_dict()
-            tensors |= {f"judge.{name}": tensor for name, tensor in judge.items()}
+        if self._judged is not None:
+            tensors |= state_file.leaves(self._judged.seen, "judged")
         numbers = {
             "state": state,
             "history": [asdict(progress) for progress in self.history],
@@ -384,18 +358,11 @@ class Fit:
         numbers, tensors = state_file.read(path)
         device = self.problem.theta.device
         like = self.trainer.init(self.problem, self.problem.theta)
-        # After init, which may evaluate gradients and leave guesses of periodic orbits behind.
         tensors = {name: tensor.to(device) for name, tensor in tensors.items()}
-        kept = state_file.within("problem.", tensors)
-        if self.ranks.world > 1:  # what was kept of the terms is the first process's part
-            kept = {name: part for name, part in kept.items() if "." not in name}
-        self.problem.load_state_dict(kept)
-        judged = state_file.within("judge.", tensors)  # those of before have none
-        if self.judge is not None and judged:
-            self.judge.load_state_dict(judged)
+        self.problem.load_state_dict(state_file.within("problem.", tensors))
         try:
             state = state_file.unpacked(like, numbers["state"], tensors)
-        except TypeError:
+        except (TypeError, KeyError):
             raise InputError(
                 f"'{path}' was left by another trainer than {type(self.trainer).__name__}; go "
                 "on with the one that the run had."
@@ -405,8 +372,14 @@ class Fit:
                 f"the fit that is to go on has had {state.iteration} iterations, more than the "
                 f"{self.trainer.limit} asked for; ask for more."
             )
-        if self.ranks.world > 1:
-            state = replace(state, residual=self.problem.residual(state.theta))
+        if self.ranks.world > 1:  # what was kept is the first process's part
+            point = self.problem.evaluate(state.theta)
+            state = replace(state, residual=point.residual, seen=point.seen)
+        if self.judge is not None:
+            own = self.problem.errors.parameters.own
+            self._judged = self.judge.evaluate(state.theta[:own])
+            seen = state_file.refilled(self._judged.seen, "judged", tensors)
+            self._judged = self._judged._replace(seen=seen)
         self.state = self.trainer.prolonged(state)
         self.reason = self.state.reason
         self.history = [Progress(**entry) for entry in numbers["history"]]
@@ -456,17 +429,18 @@ class Fit:
             detail=self.detail,
         )
 
-    def _progress(self, state: TrainerState, seconds: float) -> Progress:
+    def _progress(self, state: Any, seconds: float) -> Progress:
         """The errors of an iterate, as a line of the history; it took ``seconds`` to find."""
         clock, problem = time.perf_counter(), self.problem
-        train_rmse, validation_rmse = problem.rmse(state.theta), float("nan")
-        score = problem.cost(state.residual)
+        train_rmse, validation_rmse = problem.rmse_at(state.point), float("nan")
+        score = state.point.cost
         if self.judge is not None:
             theta = state.theta[: problem.errors.parameters.own]  # the judge finds initial states
-            score = self.judge.cost(self.judge.residual(theta))  # every output counts alike
+            self._judged = self.judge.evaluate(theta, self._judged)  # every output counts alike
             # Each process has all of these records, and its own rounding errors.
-            score = float(self.ranks.first(torch.tensor(score, dtype=torch.float64)))
-            validation_rmse = self.judge.rmse(theta)
+            score = torch.tensor(self._judged.cost, dtype=torch.float64)
+            score = float(self.ranks.first(score))
+            validation_rmse = self.judge.rmse_at(self._judged)
         better = score < self.best  # False for the NaN of a model that diverges on validation
         seconds += self._seconds + time.perf_counter() - clock
         return Progress(
@@ -474,7 +448,7 @@ class Fit:
             state.report, score,
         )  # fmt: skip
 
-    def _enter(self, state: TrainerState, progress: Progress) -> None:
+    def _enter(self, state: Any, progress: Progress) -> None:
         """Note an iterate, and keep it if it is the best."""
         if progress.best:
             self._theta_best, self.best = state.theta, progress.score

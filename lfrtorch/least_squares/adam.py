@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Float
@@ -16,6 +16,7 @@ from torch import Tensor
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.settings import documented
+from lfrtorch.least_squares.levenberg_marquardt import Point
 from lfrtorch.least_squares.options import AdamOptions
 
 
@@ -23,14 +24,14 @@ class Differentiable(Protocol):
     """A residual with the gradient of its mean square."""
 
     def gradient(
-        self, theta: Float[Tensor, " P"]
-    ) -> tuple[Float[Tensor, " M"], Float[Tensor, " P"]]:
-        """r and the gradient of its mean square at θ."""
+        self, theta: Float[Tensor, " P"], near: Point | None = None
+    ) -> tuple[Point, Float[Tensor, " P"]]:
+        """r at θ and the gradient of its mean square; ``near`` is a point close by."""
         ...
 
-    def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
+    def evaluate(self, theta: Float[Tensor, " P"], near: Point | None = None) -> Point:
         """r at θ."""
-        return self.gradient(theta)[0]
+        return self.gradient(theta, near)[0]
 
     def minibatches(self, epoch: int) -> Sequence[Differentiable]:
         """Parts of the data, another division of it in each epoch; this if it is not divided."""
@@ -47,10 +48,17 @@ class AdamState:
 
     theta: Float[Tensor, " P"]
     residual: Float[Tensor, " M"]
+    cost: float
+    seen: tuple[Any, ...]  # of ``Point``
     gradient: Float[Tensor, " P"]
     iteration: int = 0
     reason: str = ""
     moments: dict[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def point(self) -> Point:
+        """θ and what was found there."""
+        return Point(self.theta, self.residual, self.cost, self.seen)
 
     @property
     def report(self) -> dict[str, float]:
@@ -78,7 +86,8 @@ class Adam(AdamOptions):
 
     def init(self, problem: Differentiable, theta: Tensor) -> AdamState:
         """State at the first θ."""
-        return AdamState(theta, *problem.gradient(theta))
+        point, gradient = problem.gradient(theta)
+        return AdamState(*point, gradient)
 
     def step(self, problem: Differentiable, state: AdamState) -> AdamState:
         """One epoch."""
@@ -96,15 +105,15 @@ class Adam(AdamOptions):
             theta = problem.admissible(parameter.detach().clone())
             parameter.data.copy_(theta)
         if len(parts) > 1:
-            residual = problem.residual(theta)
+            point = problem.evaluate(theta, state.point)
         else:
-            residual, gradient = problem.gradient(theta)
+            point, gradient = problem.gradient(theta, state.point)
         iteration = state.iteration + 1
         reason = Reason.ALL_EPOCHS if iteration >= self.max_iter else ""
         if not torch.isfinite(gradient).all():
             reason = Reason.GRADIENT_DIVERGED
         moments = dict(optimiser.state[parameter])
-        return AdamState(theta, residual, gradient, iteration, reason, moments)
+        return AdamState(*point, gradient, iteration, reason, moments)
 
     def prolonged(self, state: AdamState) -> AdamState:
         """State to go on from if all epochs were spent and there are more now."""

@@ -45,8 +45,13 @@ class BoundedSystem:
     # is tightened until the step keeps the bounds to all orders.
 
     def __init__(self, system: System, bounds: Bounds) -> None:
-        self._system, self.scale, self.rank = system, system.scale, system.rank
+        self._system, self.size, self.rank = system, system.size, system.rank
         self.bounds = bounds
+
+    @property
+    def scale(self) -> float:
+        """Largest eigenvalue of JᵀJ."""
+        return self._system.scale
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
         """-(JᵀJ + λI)⁻¹ gradient, within the bounds."""

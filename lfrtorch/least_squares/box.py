@@ -7,23 +7,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import known_parts
 from lfrtorch.least_squares.bounded_system import BoundedSystem
 from lfrtorch.least_squares.linear_systems import System
 
 
 def bounds_of(cell: LFRCell) -> Float[Tensor, "free 2"]:
     """Least and largest value of each free parameter of a cell; infinite where there is none."""
-    parts = known_parts(cell.static)
-    model = None if parts is None else parts[0]
-    free = []
-    for p in cell.parameters():
-        if p.requires_grad:
-            ends = p.new_tensor([-torch.inf, torch.inf]).repeat(p.numel(), 1)
-            if model is not None and p is model.p:
-                ends = model.bounds / model.p_scale.unsqueeze(-1)
-            free.append(ends)
-    return torch.cat([cell.A.new_zeros(0, 2), *free])
+    sizes = [(name, p.numel(), p.requires_grad) for name, p in cell.named_parameters()]
+    of_map, at, free = cell.map.weight_bounds, 0, [cell.A.new_zeros(0, 2)]
+    for name, count, is_free in sizes:
+        ends = cell.A.new_tensor([-torch.inf, torch.inf]).repeat(count, 1)
+        if name.startswith("static."):
+            ends, at = of_map[at : at + count], at + count
+        free += [ends] * is_free
+    return torch.cat(free)
 
 
 class Box:

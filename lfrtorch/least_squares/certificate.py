@@ -33,13 +33,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 from jaxtyping import Float
+from torch import Tensor
 
 from lfrtorch._support.optional import imported
 from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import Network, is_network
-from lfrtorch.engine.static_enclosure import Enclosure, Interval
+from lfrtorch.maps.enclosure import Enclosure, Interval
 
 ACCURACY = 1e-9
 """Of the solver, relative."""
@@ -88,9 +88,9 @@ class Differences:
         )
 
     @classmethod
-    def by_neuron(cls, cell: LFRCell, static: Network, slopes: Interval) -> Differences:
-        """The slope of each neuron is anywhere in its interval."""
-        Wz, Ww = to_float64(static.Wz), to_float64(static.Ww)
+    def by_neuron(cls, cell: LFRCell, slopes: Interval, left: Tensor, right: Tensor) -> Differences:
+        """The slope of each neuron is anywhere in its interval; J = left diag(slopes) right."""
+        Ww, Wz = to_float64(left), to_float64(right)
         J = Ww * slopes.middle @ Wz
         return replace(cls._about(cell, J, Ww, slopes.radius[:, None] * Wz), neurons=True)
 
@@ -112,10 +112,12 @@ class Differences:
     @classmethod
     def of(cls, cell: LFRCell, slopes: Enclosure | None) -> list[Differences]:
         """By entry and by neuron: the smaller one, and the other if not too large."""
-        if slopes is None or not is_network(cell.static):
+        if slopes is None:
             nothing = np.zeros((0, 0))
             return [cls.by_entry(cell, Interval(nothing, nothing))]
-        systems = [cls.by_entry(cell, slopes.J), cls.by_neuron(cell, cell.static, slopes.slopes)]
+        systems = [cls.by_entry(cell, slopes.J)]
+        if slopes.neurons:
+            systems.append(cls.by_neuron(cell, *slopes.neurons))
         systems.sort(key=lambda system: system.size)
         return [systems[0], *(system for system in systems[1:] if system.size <= LARGEST)]
 

@@ -16,13 +16,10 @@ import scipy
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.utils import vector_to_parameters
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import Network, is_network, linearise_static
-from lfrtorch.engine.static_enclosure import enclosure, everywhere
 from lfrtorch.least_squares.bounded_system import BoundedSystem
 from lfrtorch.least_squares.certificate import (
     SLOWEST,
@@ -36,6 +33,7 @@ from lfrtorch.least_squares.certificate import (
     returned,
 )
 from lfrtorch.least_squares.linear_systems import System
+from lfrtorch.maps.enclosure import Enclosure, everywhere
 
 HALVINGS = 6
 """Halvings of the way to a step's end without a certificate."""
@@ -48,13 +46,13 @@ class Contracting:
     """A guarantee: every model has a certificate of a rate, by default one below 1."""
 
     def __init__(self, cell: LFRCell, rate: float = SLOWEST) -> None:
-        if not is_network(cell.static):
-            raise InputError(
-                "guarantee=contracting needs a network as the static map, whose slopes are "
-                f"bounded, not a {type(cell.static).__name__}."
-            )
         self._rate = rate
         self._cell = deepcopy(cell).to(device="cpu", dtype=torch.float64)
+        if self._slopes is None:
+            raise InputError(
+                "guarantee=contracting needs a network as the static map, whose slopes are "
+                f"bounded, not a {self._cell.map.title}."
+            )
         self._free = [p for p in self._cell.parameters() if p.requires_grad]
         self._size = sum(p.numel() for p in self._free)
         start = torch.cat([p.detach().flatten() for p in self._free])
@@ -66,15 +64,16 @@ class Contracting:
             )
 
     @property
-    def _static(self) -> Network:
-        static = self._cell.static
-        assert is_network(static)
-        return static
+    def _slopes(self) -> Enclosure | None:
+        return self._cell.map.enclosure(everywhere(self._cell.nz))
 
     def _systems(self, theta: Float[Tensor, " P"]) -> list[Differences]:
         """The inequality's matrices at θ."""
-        vector_to_parameters(theta[: self._size].detach().cpu().double(), self._free)
-        slopes = enclosure(self._static, everywhere(self._cell.nz))
+        parts = theta[: self._size].detach().cpu().double().split([p.numel() for p in self._free])
+        for p, part in zip(self._free, parts, strict=True):
+            p.data = part.view_as(p)
+        slopes = self._slopes
+        assert slopes is not None
         systems = Differences.of(self._cell, slopes)
         if not slopes.J.radius.all() and len(systems) > 1:  # at a start without output
             systems = [system for system in systems if system.neurons]
@@ -153,20 +152,21 @@ class Contracting:
 
     def _matrices(self, system: Differences) -> tuple[Tensor, Tensor, Tensor]:
         """A, B and C of the system as functions of the parameters."""
-        cell, static = self._cell, self._static
-        slopes = enclosure(static, everywhere(cell.nz))
+        cell, static, slopes = self._cell, self._cell.map, self._slopes
+        assert slopes is not None
         if system.neurons:
-            middle = torch.as_tensor(slopes.slopes.middle)
-            radius = torch.as_tensor(slopes.slopes.radius).unsqueeze(1)
-            J, left, right = static.Ww * middle @ static.Wz, static.Ww, radius * static.Wz
+            assert slopes.neurons is not None
+            s, left, right = slopes.neurons
+            J = left * torch.as_tensor(s.middle) @ right
+            right = torch.as_tensor(s.radius).unsqueeze(1) * right
         else:
             # Each entry's extremes are at certain z, which stay the extremes to first order.
             centres = torch.as_tensor(slopes.centres)
-            weights: dict[str, Tensor] = dict(static.named_parameters())
+            phi = static.flat_weights()
             with torch.no_grad():
-                at = linearise_static(static, centres.unsqueeze(0), weights).J[0].flatten(1)
+                at = static.slope(centres.unsqueeze(0), phi)[0].flatten(1)
             ends = centres[torch.cat([at.argmin(0), at.argmax(0)])]
-            every = linearise_static(static, ends.unsqueeze(0), weights).J[0].flatten(1)
+            every = static.slope(ends.unsqueeze(0), phi)[0].flatten(1)
             low, high = every.unflatten(0, (2, -1)).diagonal(dim1=1, dim2=2)
             J = ((low + high) / 2).view(cell.nw, cell.nz)
             radius = ((high - low) / 2).view(cell.nw, cell.nz)

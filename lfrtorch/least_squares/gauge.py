@@ -12,6 +12,7 @@ rows G[left_out] must be well conditioned: a QR decomposition with pivoting pick
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -23,12 +24,12 @@ from torch import Tensor
 from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import networks_of
+from lfrtorch.engine.weights import Weights
 
 DEPENDENT = 1e-3
 """A column is left out if its pivot is at least this fraction of the largest pivot."""
 
-DIRECT, RELUCTANT = ("Cy", "Dyu", "Dyw"), 0.1
+RELUCTANT = 0.1
 """Columns of the output equation need no recurrence, so they are left out only if another pivot is
 ten times smaller."""
 
@@ -37,16 +38,27 @@ class Reduction(NamedTuple):
     """The columns of a Jacobian that are computed, and how all columns follow from them."""
 
     kept: Int[Tensor, " K"]
-    expand: Float[Tensor, "K P"]
+    expand: Float[Tensor, "K P"] | None
+    """None if all columns are kept."""
 
     def columns(self, own: Float[Tensor, "M K"]) -> Float[Tensor, "M P"]:
         """All columns from the kept ones: own @ expand, most of which is the identity."""
+        if self.expand is None:
+            return own
         whole = own.new_empty(len(own), self.expand.shape[1])
         whole[:, self.kept] = own
         left_out = torch.ones(whole.shape[1], dtype=torch.bool, device=own.device)
         left_out[self.kept] = False
         whole[:, left_out] = own @ self.expand[:, left_out]
         return whole
+
+    def reduced(self, d_theta: Tensor) -> Tensor:
+        """A change of the kept parameters alone that has the same outputs."""
+        return d_theta if self.expand is None else self.expand @ d_theta
+
+    def gradient(self, own: Float[Tensor, " K"]) -> Float[Tensor, " P"]:
+        """A gradient from that in the kept columns."""
+        return own if self.expand is None else self.expand.mT @ own
 
 
 ROUNDING = 1e-10
@@ -55,7 +67,7 @@ ROUNDING = 1e-10
 
 @torch.no_grad()
 def reduction(
-    cell: LFRCell,
+    model: LFRCell | Weights,
     initial_states: Float[Tensor, "S nx"],
     *,
     coordinates: bool = True,
@@ -66,48 +78,48 @@ def reduction(
     # Those of ``initial_states`` come last and are kept. ``coordinates``: no initial state is given
     # in those of x. ``before``: the reduction at weights close by, whose columns are kept if they
     # still do. ``fixed`` entries of the free parameters have columns of zeros.
-    G = to_float64(_directions(cell, initial_states))[:, 0 if coordinates else cell.nx**2 :]
-    parameters = list(cell.named_parameters())
-    counts = [p.numel() for _, p in parameters] + [initial_states.numel()]
-    mask = np.repeat([p.requires_grad for _, p in parameters] + [True], counts)
-    linear = np.repeat([not n.startswith("static.") for n, _ in parameters] + [False], counts)
-    theta = np.cumsum(mask) - 1  # position of each free entry in θ
-    P = int(mask.sum())
+    W = model.weights()
+    layout, states = W.layout, initial_states.numel()
+    G = _directions(W, initial_states)[:, 0 if coordinates else W.nx**2 :]
+    free = np.concatenate([layout.free, len(W.flat) + np.arange(states)])
+    P, like = len(free), initial_states
+    places, size = np.arange(P), np.linalg.norm(G)
     if fixed is not None:
-        mask[np.flatnonzero(mask)[: len(fixed)]] = ~fixed.cpu().numpy()
-    size = np.linalg.norm(G)
-    places = torch.as_tensor(theta[mask]).to(cell.A.device)
+        places = np.delete(places, np.flatnonzero(fixed.cpu().numpy()))
     if not np.isfinite(size):
-        return _placed(everything(cell.A.new_zeros(len(places))), places, P)
-    if not mask.all():
+        return _placed(everything(len(places)), places, P, like)
+    own = free[places]
+    if len(own) < len(G):
         # Directions that move no fixed parameter: combinations N of G with G[fixed] N = 0.
-        G = G[mask] @ scipy.linalg.null_space(G[~mask]) if G.shape[1] else G[mask]
+        others = np.delete(G, own, axis=0)
+        G = G[own] @ scipy.linalg.null_space(others) if G.shape[1] else G[own]
     elif before is not None and len(before.kept) + G.shape[1] == len(G):
         left_out = np.setdiff1d(np.arange(len(G)), before.kept.cpu().numpy(), assume_unique=True)
-        found = _expanded(G, left_out, cell.A)
+        found = _expanded(G, left_out, like)
         if found is not None:
             return found
     # Only columns of the linear part are left out: those of the static map are computed together.
-    lti = int((mask & linear).sum())
-    direct = np.repeat([n in DIRECT for n, _ in parameters] + [False], counts)[mask][:lti]
+    lti = int((own < layout.phi.start).sum())
+    direct = layout.table[0, own[:lti]] == 2
     pick = np.where(direct, RELUCTANT, 1.0)[:, None] * G[:lti]
     Q, R, pivots = scipy.linalg.qr(pick.T, mode="economic", pivoting=True)
     diagonal = np.abs(np.diag(R))
     least = max(DEPENDENT * diagonal.max(initial=0.0), ROUNDING * size)
     rank = int((diagonal > least).sum())
-    found = _expanded(G @ Q[:, :rank], pivots[:rank], cell.A)
+    found = _expanded(G @ Q[:, :rank], pivots[:rank], like)
     if found is None:
-        found = everything(cell.A.new_zeros(len(G)))
-    return _placed(found, places, P)
+        found = everything(len(G))
+    return _placed(found, places, P, like)
 
 
-def _placed(found: Reduction, places: Int[Tensor, " n"], P: int) -> Reduction:
+def _placed(found: Reduction, places: Int[Integers, " n"], P: int, like: Tensor) -> Reduction:
     """A reduction of the columns at some places as one of all P; the others are zeros."""
     if len(places) == P:
         return found
-    expand = found.expand.new_zeros(len(found.kept), P)
-    expand[:, places] = found.expand
-    return Reduction(places[found.kept], expand)
+    kept, at = found.kept, torch.from_numpy(places)
+    expand = like.new_zeros(len(kept), P)
+    expand[:, at] = torch.eye(len(kept)).to(like) if found.expand is None else found.expand
+    return Reduction(at.to(kept.device)[kept], expand)
 
 
 def _expanded(
@@ -126,45 +138,45 @@ def _expanded(
     return Reduction(torch.as_tensor(kept).to(like.device), torch.as_tensor(expand).to(like))
 
 
-def everything(theta: Float[Tensor, " P"]) -> Reduction:
-    """The reduction that keeps all columns."""
-    kept = torch.arange(len(theta), device=theta.device)
-    return Reduction(kept, torch.eye(len(theta)).to(theta))
+@lru_cache(maxsize=64)
+def everything(count: int) -> Reduction:
+    """The reduction that keeps all of so many columns."""
+    return Reduction(torch.arange(count), None)
 
 
 def _directions(
-    cell: LFRCell, initial_states: Float[Tensor, "S nx"]
-) -> Float[Tensor, "parameters directions"]:
-    """Gauge directions G: of all parameters, then the initial states."""
-    A, Bu, Bw, Cz, Dzu = cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu
+    W: Weights, initial_states: Float[Tensor, "S nx"]
+) -> Float[Array, "numbers directions"]:
+    """Gauge directions G: of all numbers, then the initial states."""
     # T is every matrix with one entry 1, stacked: a direction for each. x -> (I + εT) x changes
     # A to A + ε (TA - AT), and so on; z -> (I + εT) z and w -> (I + εT)⁻¹ w likewise.
-    T = _units(cell.nx, A)
-    changes = {"A": T @ A - A @ T, "Bu": T @ Bu, "Bw": T @ Bw, "Cz": -Cz @ T, "Cy": -cell.Cy @ T}
-    groups: list[tuple[dict[str, Tensor], Tensor | None]] = [(changes, initial_states @ T.mT)]
-    for prefix, network, first_z, first_w in networks_of(cell.static):
-        Wz, Ww, bw = network.Wz, network.Ww, network.bw
-        z, w = slice(first_z, first_z + Wz.shape[1]), slice(first_w, first_w + len(Ww))
-        T = _units(Wz.shape[1], A)
-        changes = {name: A.new_zeros(len(T), *p.shape) for name, p in (("Cz", Cz), ("Dzu", Dzu))}
-        changes["Cz"][:, z], changes["Dzu"][:, z] = T @ Cz[z], T @ Dzu[z]
-        groups.append((changes | {f"{prefix}Wz": -Wz @ T}, None))
-        T, Dyw = _units(len(Ww), A), cell.Dyw
-        changes = {name: A.new_zeros(len(T), *p.shape) for name, p in (("Bw", Bw), ("Dyw", Dyw))}
-        changes["Bw"][..., w], changes["Dyw"][..., w] = -Bw[:, w] @ T, -Dyw[:, w] @ T
-        groups.append((changes | {f"{prefix}Ww": T @ Ww, f"{prefix}bw": T @ bw}, None))
-    columns = []
-    for changes, states in groups:
-        count = len(next(iter(changes.values())))
-        parts = [
-            changes[name].flatten(1) if name in changes else A.new_zeros(count, p.numel())
-            for name, p in cell.named_parameters()
-        ]
-        parts.append(
-            A.new_zeros(count, initial_states.numel()) if states is None else states.flatten(1)
-        )
-        columns.append(torch.cat(parts, dim=1))
-    return torch.cat(columns).mT
+    T = _units(W.nx, W.flat)
+    of_x = {"A": T @ W.A - W.A @ T, "Bu": T @ W.Bu, "Bw": T @ W.Bw, "Cz": -W.Cz @ T}
+    groups = [_flat(W, of_x | {"Cy": -W.Cy @ T, "x0": initial_states @ T.mT}, initial_states)]
+    weights = W.map.named_weights(W.phi)
+    for symmetry in W.map.symmetries:
+        own = symmetry.place
+        T = _units(own.stop - own.start, W.flat)
+        changes: dict[str, Tensor] = dict(symmetry.changes(T, weights))
+        for name in ("Cz", "Dzu") if symmetry.signal == "z" else ("Bw", "Dyw"):
+            matrix = getattr(W, name)
+            change = changes[name] = matrix.new_zeros(len(T), *matrix.shape)
+            if symmetry.signal == "z":
+                change[:, own] = T @ matrix[own]
+            else:
+                change[:, :, own] = -matrix[:, own] @ T
+        groups.append(_flat(W, changes, initial_states))
+    return to_float64(torch.cat(groups).mT)
+
+
+def _flat(W: Weights, changes: dict[str, Tensor], initial_states: Tensor) -> Tensor:
+    """Changes by name as rows of all numbers, then the initial states."""
+    rows = len(next(iter(changes.values())))
+    found = W.flat.new_zeros(rows, len(W.flat) + initial_states.numel())
+    for name, change in changes.items():
+        place = slice(len(W.flat), None) if name == "x0" else W.layout.place(name)
+        found[:, place] = change.flatten(1)
+    return found
 
 
 def _units(n: int, like: Tensor) -> Float[Tensor, "{n}*{n} {n} {n}"]:

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -62,8 +63,27 @@ class Jacobian(Protocol):
         ...
 
 
+class Point(NamedTuple):
+    """A θ and what a problem found there.
+
+    Args:
+        theta: θ (P,).
+        residual: r (M,).
+        cost: |r|².
+        seen: what else the problem needs for derivatives there, as trajectories: tuples of tensors.
+    """
+
+    theta: Tensor
+    residual: Tensor
+    cost: float
+    seen: tuple[Any, ...] = ()
+
+
 class LeastSquares(Protocol):
     """A residual and its Jacobian. A residual that is undefined is infinite or NaN."""
+
+    # A simple problem has ``residual`` and ``linearise``. One that keeps more of a θ than r has
+    # ``evaluate`` and ``linearise_at``.
 
     def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """r at θ."""
@@ -73,9 +93,18 @@ class LeastSquares(Protocol):
         """dr/dθ at θ."""
         ...
 
+    def evaluate(self, theta: Float[Tensor, " P"], near: Point | None = None) -> Point:
+        """r at θ; ``near`` is a point close by."""
+        residual = self.residual(theta)
+        return Point(theta, residual, self.cost(residual))
+
+    def linearise_at(self, point: Point) -> Jacobian:
+        """dr/dθ at a point."""
+        return self.linearise(point.theta)
+
     def cost(self, residual: Float[Tensor, " M"]) -> float:
         """|r|², summed over the processes that share r."""
-        ...
+        return float(residual @ residual)
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
         """θ, or one near it that the search may go to."""
@@ -89,8 +118,9 @@ class LMState:
     theta: Float[Tensor, " P"]
     residual: Float[Tensor, " M"]
     cost: float
+    seen: tuple[Any, ...] = ()  # of ``Point``
     damping: float | None = None  # None before the first step
-    scale: float = 1.0  # largest squared singular value of the Jacobian in the last step
+    scale: float = 1.0  # about the largest squared singular value of J in the last step
     growth: float = 2.0  # factor of λ on the next rejection
     iteration: int = 0  # accepted and refused steps
     gain_ratio: float = float("nan")
@@ -98,6 +128,11 @@ class LMState:
     rank: int = 0
     quiet: int = 0  # steps in a row that changed the cost by less than the tolerance
     reason: str = ""
+
+    @cached_property
+    def point(self) -> Point:
+        """θ and what was found there."""
+        return Point(self.theta, self.residual, self.cost, self.seen)
 
     @property
     def report(self) -> dict[str, float]:
@@ -115,11 +150,14 @@ class LMState:
 class _Trial(NamedTuple):
     """A step and what it reached."""
 
-    theta: Tensor
-    residual: Tensor
-    cost: float
+    point: Point
     damping: float
     gain_ratio: float
+
+    @property
+    def cost(self) -> float:
+        """|r|²."""
+        return self.point.cost
 
 
 @typed()
@@ -142,23 +180,22 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
 
     def init(self, problem: LeastSquares, theta: Tensor) -> LMState:
         """State at the first θ."""
-        residual = problem.residual(theta)
-        cost = problem.cost(residual)
-        if not math.isfinite(cost):
+        point = problem.evaluate(theta)
+        if not math.isfinite(point.cost):
             raise InputError(
                 "the residual is not finite at the start of the search; start from a stable model."
             )
-        return LMState(theta, residual, cost)
+        return LMState(*point)
 
     def step(self, problem: LeastSquares, state: LMState) -> LMState:
         """One iteration: linearise, then raise the damping until a step lowers the cost."""
         # The first one also lowers it, as long as the next step is better.
-        jacobian = problem.linearise(state.theta)
+        jacobian = problem.linearise_at(state.point)
         damping, least = state.damping, math.inf
         first = min(self.damping, self.least_damping)
         relative = first if damping is None else damping / state.scale
         system, gradient = jacobian.system(relative, self.truncation)
-        scale = system.scale
+        scale = system.scale if damping is None else system.size
         if not 0.0 < scale < math.inf:
             return replace(state, reason=Reason.JACOBIAN_VANISHES)
         if damping is None:  # to be lowered within this step
@@ -191,9 +228,7 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
         quiet = state.quiet + 1 if actual <= self.tolerance * state.cost else 0
         accepted = replace(
             state,
-            theta=best.theta,
-            residual=best.residual,
-            cost=best.cost,
+            **best.point._asdict(),
             damping=best.damping * max(FASTEST_DECREASE, 1.0 - (2.0 * best.gain_ratio - 1.0) ** 3),
             scale=scale,
             growth=2.0,
@@ -203,7 +238,7 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
             rank=system.rank,
             quiet=quiet,
         )
-        floor = self.floor**2 * problem.cost(torch.ones_like(best.residual))
+        floor = self.floor**2 * problem.cost(torch.ones_like(best.point.residual))
         if max(accepted.cost, state.cost) <= floor:  # one more step for what is hardly determined
             return replace(accepted, reason=Reason.RESIDUAL_VANISHES)
         if quiet >= self.patience:
@@ -242,15 +277,13 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
         """The step at one damping."""
         delta = system.solve(gradient, damping)
         # Decrease of |r + J δ|² by the δ with (JᵀJ + λI) δ = -gradient.
-        predicted = float(damping * delta.square().sum() - gradient @ delta)
+        predicted = damping * float(delta @ delta) - float(gradient @ delta)
         theta = state.theta + delta
         if self.acceleration:
             theta = theta + self._acceleration(problem, state, jacobian, system, delta, damping)
-        theta = problem.admissible(theta)
-        residual = problem.residual(theta)
-        cost = problem.cost(residual)
-        gain_ratio = (state.cost - cost) / predicted if predicted > 0 else float("nan")
-        return _Trial(theta, residual, cost, damping, gain_ratio)
+        point = problem.evaluate(problem.admissible(theta), state.point)
+        gain_ratio = (state.cost - point.cost) / predicted if predicted > 0 else float("nan")
+        return _Trial(point, damping, gain_ratio)
 
     def _acceleration(
         self,
@@ -263,11 +296,14 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
     ) -> Tensor:
         """Second-order correction a = ½ argmin |J a + r''|² + λ|a|², or 0 if it is too long."""
         h = self.finite_step
-        ahead = problem.residual(state.theta + h * delta)
-        if not math.isfinite(problem.cost(ahead)):
+        ahead = problem.evaluate(state.theta + h * delta, state.point)
+        if not math.isfinite(ahead.cost):
             return torch.zeros_like(delta)
         # r'' along δ, from r(θ + hδ) = r + h J δ + h² r'' / 2 + O(h³).
-        second = (ahead - state.residual).div_(h).sub_(jacobian.tangent(delta)).mul_(2.0 / h)
+        second = (
+            (ahead.residual - state.residual).div_(h).sub_(jacobian.tangent(delta)).mul_(2.0 / h)
+        )
         a = 0.5 * system.solve(jacobian.adjoint(second), damping)
-        trusted = 2.0 * a.norm() <= self.acceleration_limit * delta.norm()  # False for NaN
+        squares = 4.0 * float(a @ a), self.acceleration_limit**2 * float(delta @ delta)
+        trusted = squares[0] <= squares[1]  # False for NaN
         return a if trusted else torch.zeros_like(delta)

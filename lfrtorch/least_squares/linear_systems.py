@@ -9,6 +9,7 @@ damping λ: ``SVDSystem`` from R, ``CholeskySystem`` and ``ReducedSystem`` from 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -41,8 +42,13 @@ KRYLOV = 400
 class System(Protocol):
     """JᵀJ decomposed, for several dampings."""
 
-    scale: float
-    """Largest eigenvalue of JᵀJ; NaN if an entry is not finite."""
+    @property
+    def scale(self) -> float:
+        """Largest eigenvalue of JᵀJ; NaN if an entry is not finite."""
+        ...
+
+    size: float
+    """The same or more, by a factor of √P at most, at no cost."""
 
     rank: int
     """Directions that J sees."""
@@ -56,13 +62,15 @@ class SVDSystem:
     """From R with RᵀR = JᵀJ, by singular values: exact for any damping."""
 
     def __init__(self, R: Float[Tensor, "K P"], truncation: float) -> None:
-        self.scale, self.rank = float("nan"), 0
+        self.scale = self.size = float("nan")
+        self.rank = 0
         if torch.isfinite(R).all():
             s, Vh = _singular(R)
             kept = s > truncation * s[:1]  # of no rows there is none
             # A parameter that R does not see stays as it is, to the last bit.
             self._squares, self._Vh = s[kept].square(), Vh[kept].masked_fill((R == 0).all(0), 0.0)
-            self.scale, self.rank = float(s[:1].square().sum()), len(self._squares)
+            self.scale = self.size = float(s[:1].square().sum())
+            self.rank = len(self._squares)
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
         """-(JᵀJ + λI)⁻¹ gradient, without its part along the directions that are left out."""
@@ -87,19 +95,23 @@ class CholeskySystem:
     """From G = JᵀJ, by Cholesky: three times faster, for λ well above the rounding errors of G."""
 
     def __init__(self, G: Float[Tensor, "P P"], rank: int) -> None:
-        finite = bool(torch.isfinite(G).all())
         self._G, self.rank = G, rank
         self._latest: tuple[float, Tensor] | None = None  # damping and Cholesky factor
-        self.scale = largest_eigenvalue(G) if finite else float("nan")
+        self.size = float(torch.linalg.matrix_norm(G))
+
+    @property
+    def scale(self) -> float:
+        """Largest eigenvalue of JᵀJ; NaN if an entry is not finite."""
+        return largest_eigenvalue(self._G) if math.isfinite(self.size) else float("nan")
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
         """-(JᵀJ + λI)⁻¹ gradient; NaN if rounding errors leave no positive definite matrix."""
         if self._latest is None or self._latest[0] != damping:
-            damped = self._G.clone()
+            damped = self._G.clone(memory_format=torch.contiguous_format)
             damped.diagonal().add_(damping)
             L, failed = torch.linalg.cholesky_ex(damped)
-            self._latest = damping, torch.full_like(L, torch.nan) if failed else L
-        return -torch.cholesky_solve(gradient.unsqueeze(-1), self._latest[1]).squeeze(-1)
+            self._latest = damping, L.fill_(torch.nan) if failed else L
+        return torch.cholesky_solve(gradient.unsqueeze(-1), self._latest[1]).squeeze(-1).neg_()
 
 
 class ReducedSystem:
@@ -117,7 +129,12 @@ class ReducedSystem:
         own = self._L.mT @ G @ self._L
         own.diagonal().add_(ridge)
         self._own = CholeskySystem(own, self.rank)
-        self.scale = self._own.scale
+        self.size = self._own.size
+
+    @property
+    def scale(self) -> float:
+        """Largest eigenvalue of JᵀJ."""
+        return self._own.scale
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
         """-(JᵀJ + (ridge + λ) I)⁻¹ gradient."""
@@ -151,8 +168,16 @@ class BroadcastSystem:
 
     def __init__(self, system: System, ranks: Ranks) -> None:
         self._system, self._ranks = system, ranks
-        self.scale = float(ranks.first(torch.tensor(system.scale, dtype=torch.float64)))
+        self.size = self._shared(system.size)
         self.rank = int(ranks.first(torch.tensor(system.rank)))
+
+    @property
+    def scale(self) -> float:
+        """Largest eigenvalue of JᵀJ."""
+        return self._shared(self._system.scale)
+
+    def _shared(self, number: float) -> float:
+        return float(self._ranks.first(torch.tensor(number, dtype=torch.float64)))
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
         """-(JᵀJ + λI)⁻¹ gradient."""
@@ -188,6 +213,10 @@ class QRAccumulator:
         """Add the rows of another times a matrix."""
         self.fold(other.R @ change)
 
+    def add_columns(self, other: Any, kept: Int[Tensor, " n"]) -> None:
+        """Add some columns of the rows of another."""
+        self.fold(other.R[:, kept])
+
     def combine(self, ranks: Ranks) -> None:
         """Add the rows of all other processes."""
         self._parts = [torch.linalg.qr(ranks.stack(self.R), mode="r").R]
@@ -209,8 +238,9 @@ class GramAccumulator:
     def fold(self, rows: Float[Tensor, "m n"]) -> None:
         """Add rows."""
         n = rows.shape[1]
-        if rows.device.type != "cpu" or n < WIDE or _pieces(rows) > 1:
-            self.add(*_of_pieces(_square, rows))
+        pieces = _pieces(rows)
+        if rows.device.type != "cpu" or n < WIDE or pieces > 1:
+            self.add(*(_of_pieces(_square, rows) if pieces > 1 else [product(rows.mT, rows)]))
             return
         if not self._parts:
             self._parts = [rows.new_zeros(n, n)]
@@ -234,6 +264,10 @@ class GramAccumulator:
         """Add the rows of another times a matrix."""
         self.add(change.mT @ other.G @ change)
 
+    def add_columns(self, other: Any, kept: Int[Tensor, " n"]) -> None:
+        """Add some columns of the rows of another."""
+        self.add(other.G[kept.unsqueeze(1), kept])
+
     def combine(self, ranks: Ranks) -> None:
         """Add the rows of all other processes."""
         self._parts = [ranks.sum(self.G)]
@@ -245,7 +279,8 @@ class GramAccumulator:
 
     def add(self, *parts: Float[Tensor, "n n"]) -> None:
         """Add AᵀA of more rows."""
-        self._parts = [torch.stack([*self._parts, *parts]).sum(0)]
+        every = [*self._parts, *parts]
+        self._parts = every if len(every) == 1 else [torch.stack(every).sum(0)]
 
 
 def tied(rows: Float[Tensor, "M columns"], tie: Float[Tensor, "m n"]) -> Float[Tensor, "M n+1"]:

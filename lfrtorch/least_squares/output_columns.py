@@ -19,7 +19,7 @@ class OutputColumns:
 
     def __init__(self, linearisation: Linearisation, own: Int[Tensor, " K"]) -> None:
         self._linearisation = linearisation
-        entries = linearisation.layout.columns(own).y.to(own.device)
+        entries = torch.from_numpy(linearisation.columns(own).y).to(own.device)
         self.place, self._output, self._signal = entries.T
         self._with_rows: dict[int, Tensor] = {}
         self._of_signals: dict[int, Tensor] = {}

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from copy import copy
-from functools import partial
+from functools import cached_property, partial
 from typing import Self
 
 import torch
@@ -16,13 +16,12 @@ from torch import Tensor
 from lfrtorch._support.errors import InputError
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import known_parts
 from lfrtorch.least_squares.exact_integrators import fixed_parameters
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
 from lfrtorch.least_squares.guarantee import Guarantee, Name, guarantee_of
 from lfrtorch.least_squares.jacobian import Jacobian
-from lfrtorch.least_squares.levenberg_marquardt import LeastSquares
+from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, Point
 from lfrtorch.least_squares.ridge import Ridge, RidgePenalty, ridge_by_entry
 from lfrtorch.least_squares.simulation_errors import SimulationErrors, SystemErrors
 from lfrtorch.least_squares.term import Term
@@ -32,12 +31,15 @@ from lfrtorch.records import Record, as_records, of_one_unit
 BATCH = 32
 """Records in a minibatch, about."""
 
+REDUCING = 2e7
+"""Products that dependent columns of J take, from which they are left out."""
+
 
 class Problem(LeastSquares):
     """r(θ): the residual of each term, one after another; a ridge is the last."""
 
-    # θ are the free parameters of an LFR, then the initial states of the records whose start is
-    # ``"estimated"``; θ_0 is θ now. The LFR gets a θ by ``write`` alone.
+    # θ are the free numbers of an LFR, then the initial states of the records whose start is
+    # ``"estimated"``; θ_0 is θ at the start. The LFR is read once, and gets a θ by ``write`` alone.
 
     def __init__(
         self,
@@ -51,11 +53,11 @@ class Problem(LeastSquares):
     ) -> None:
         self.lfr, self.errors, self.ranks = lfr, errors, errors.ranks
         self._terms: list[Term] = [errors, *others]
-        self._initial_states = errors.first_initial_states()
-        self._theta_0 = self.theta
+        self.theta = errors.first_theta()
+        """θ_0."""
         self.weigh(ridge)
         self._guarantee = guarantee
-        self.fixed = torch.zeros_like(self._theta_0, dtype=torch.bool)
+        self.fixed = torch.zeros_like(self.theta, dtype=torch.bool)
         """Which entries of θ are constants: columns of zeros in J."""
         self.fixed[: errors.parameters.own] = fixed_parameters(lfr.cell) if fixed is None else fixed
         self._reduced: Reduction | None = None
@@ -98,8 +100,8 @@ class Problem(LeastSquares):
         found = cls(model.lfr, errors, ridge=ridge)
         normalised = [model.scaler.normalise(record) for record in as_records(records)]
         system = SystemErrors(model.lfr.cell, normalised, errors.ranks)
-        theta = found.theta
-        costs = [found.cost(term.residual(theta)) for term in (errors, system)]
+        terms: tuple[Term, ...] = errors, system
+        costs = [found.cost(term.evaluate(found.theta)[0]) for term in terms]
         weight = simulation * math.sqrt(costs[0] / costs[1]) if costs[1] > 0 else 0.0
         system.weight = weight if math.isfinite(weight) else 0.0
         found._terms.insert(1, system)
@@ -126,42 +128,56 @@ class Problem(LeastSquares):
         return cls(model.lfr, errors, others)
 
     @property
-    def theta(self) -> Float[Tensor, " P"]:
-        """Parameters as they stand in the module, then the estimated initial states."""
-        return self.errors.parameters.of(self.lfr.cell, self._initial_states)
-
-    @property
     def size(self) -> int:
         """Number of scored samples and outputs."""
         return self.errors.size
 
+    def read(self) -> Float[Tensor, " P"]:
+        """θ as it stands in the module; initial states are those of θ_0."""
+        own = self.errors.parameters.read(self.lfr.cell)
+        return torch.cat([own, self.theta[len(own) :]])
+
     def write(self, theta: Float[Tensor, " P"]) -> None:
         """Put θ into the module."""
-        theta = theta.detach().to(self._theta_0, copy=True)  # the module's weights are its own
         self.errors.parameters.write(self.lfr.cell, theta)
-        self._initial_states = self.errors.parameters.initial_states(theta)
 
     def weigh(self, ridge: Ridge) -> None:
         """Give the ridge another weight; it still pulls to where the search began."""
         weight = ridge_by_entry(ridge, self.errors.parameters.sizes)
         self._terms = [term for term in self._terms if not isinstance(term, RidgePenalty)]
         if weight.any() and self.ranks.rank == 0:
-            self._terms.append(RidgePenalty(weight, self._theta_0))
+            self._terms.append(RidgePenalty(weight, self.theta))
 
     def rmse(self, theta: Float[Tensor, " P"]) -> float:
         """RMSE at θ over scored samples and outputs, unweighted, as in a score.
 
         In the unit of the outputs; of several units each in that of the scaling, about its rms.
         """
-        return self.errors.rmse(theta)
+        return self.rmse_at(self.evaluate(theta))
+
+    def rmse_at(self, point: Point) -> float:
+        """RMSE at a point."""
+        return self.errors.rmse(point.seen[0])
 
     def cost(self, residual: Float[Tensor, " M"]) -> float:
         """|r|² of all processes."""
-        return float(self.ranks.sum(residual.square().sum()))
+        own = residual @ residual
+        return float(own if self.ranks.world == 1 else self.ranks.sum(own))
+
+    def evaluate(self, theta: Float[Tensor, " P"], near: Point | None = None) -> Point:
+        """r at θ, infinite or NaN if the model diverges, and the trajectories.
+
+        ``near`` is a point close by, from whose trajectories the search for these begins.
+        """
+        before = [None] * len(self._terms) if near is None else near.seen
+        terms = zip(self._terms, before, strict=True)
+        residuals, seen = zip(*[term.evaluate(theta, own) for term, own in terms], strict=True)
+        residual = residuals[0] if len(residuals) == 1 else torch.cat(residuals)
+        return Point(theta, residual, self.cost(residual), seen)
 
     def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """r at θ; infinite or NaN if the model diverges."""
-        return torch.cat([term.residual(theta) for term in self._terms])
+        return self.evaluate(theta).residual
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
         """θ, or one near it that keeps the guarantee."""
@@ -169,13 +185,17 @@ class Problem(LeastSquares):
             return theta
         return self.ranks.first(self._guarantee.admissible(theta))
 
-    def linearise(
-        self, theta: Float[Tensor, " P"], *, reduce: bool = True, eliminate: bool = True
+    def linearise(self, theta: Float[Tensor, " P"], *, eliminate: bool = True) -> Jacobian:
+        """dr/dθ at θ."""
+        return self.linearise_at(self.evaluate(theta), eliminate=eliminate)
+
+    def linearise_at(
+        self, point: Point, *, reduce: bool = True, eliminate: bool = True
     ) -> Jacobian:
-        """dr/dθ at θ; ``reduce``: without columns that gauge directions make dependent."""
+        """dr/dθ at a point; ``reduce``: without columns that gauge directions make dependent."""
         # Initial states are eliminated if they outnumber the parameters; a system without damping
         # needs them all.
-        own = self.errors.parameters.own
+        theta, own = point.theta, self.errors.parameters.own
         states = len(theta) - own
         eliminate = eliminate and states > own and self.ranks.world == 1
         eliminate = eliminate and all(term.eliminates for term in self._terms)
@@ -183,31 +203,47 @@ class Problem(LeastSquares):
             spectral = sum(group.y.numel() for group in self.errors.groups if group.spectral)
             check_fit_memory(self.lfr.cell, 0 if eliminate else states, spectral)
             self._checked.add(eliminate)
-        rows = [part for t in self._terms for part in t.linearise(theta, eliminate=eliminate)]
-        if eliminate:
-            reduced = everything(theta[:own])
-        elif reduce:
+        rows = [
+            part
+            for term, seen in zip(self._terms, point.seen, strict=True)
+            for part in term.linearise(theta, seen, eliminate=eliminate)
+        ]
+        shared = own if eliminate else len(theta)
+        reduced = everything(shared)
+        if reduce and not eliminate and self._worth_reducing:
             reduced = self._reduction(theta)
-        else:
-            reduced = everything(theta)
-        if self._guarantee is None:
-            return Jacobian(rows, reduced, self.fixed, self.ranks)
-        bounded = partial(self._guarantee.bounded, theta)
-        return Jacobian(rows, reduced, self.fixed, self.ranks, bounded)
+        bounded = None if self._guarantee is None else partial(self._guarantee.bounded, theta)
+        return Jacobian(rows, reduced, self.fixed, self.ranks, shared, self.rank, bounded)
+
+    @cached_property
+    def _worth_reducing(self) -> bool:
+        """Whether columns that gauge directions make dependent take longer than to find them."""
+        # The damping holds those directions as well: it is a matter of time alone.
+        W, P = self.lfr.cell.weights(), len(self.theta)
+        sizes = [s.place.stop - s.place.start for s in W.map.symmetries]
+        left = P - W.nx**2 - sum(n**2 for n in sizes)
+        return (P**2 - left**2) * self.size * W.ny > REDUCING
+
+    @cached_property
+    def rank(self) -> int:
+        """Number of directions of θ that the outputs can tell, without those of the gauge."""
+        return len(self._reduction(self.theta).kept)
 
     def _reduction(self, theta: Float[Tensor, " P"]) -> Reduction:
         """The columns that gauge directions leave, the same ones on all processes."""
         held = any(group.x0 is not None for group in self.errors.groups)
         held = bool(self.ranks.sum(theta.new_tensor(float(held))))
         found = reduction(
-            self.errors.cell_at(theta),
+            self.errors.parameters.weights(theta),
             self.errors.parameters.initial_states(theta),
             coordinates=not held,
             before=self._reduced,
             fixed=self.fixed,
         )
         # Rounding errors decide between columns that are as good; processes must agree.
-        self._reduced = Reduction(*map(self.ranks.first, found))
+        kept, expand = found
+        expand = expand if expand is None else self.ranks.first(expand)
+        self._reduced = Reduction(self.ranks.first(kept), expand)
         return self._reduced
 
     def jacobian(self, theta: Float[Tensor, " P"]) -> Float[Tensor, "M P"]:
@@ -215,11 +251,13 @@ class Problem(LeastSquares):
         return self.linearise(theta, eliminate=False).whole()
 
     def gradient(
-        self, theta: Float[Tensor, " P"]
-    ) -> tuple[Float[Tensor, " M"], Float[Tensor, " P"]]:
-        """r and the gradient of |r|² / samples, by the adjoint recurrence."""
-        r = self.residual(theta)
-        return r, 2.0 / self.size * self.linearise(theta, reduce=False).adjoint(r)
+        self, theta: Float[Tensor, " P"], near: Point | None = None
+    ) -> tuple[Point, Float[Tensor, " P"]]:
+        """r at θ and the gradient of |r|² / samples, by the adjoint recurrence."""
+        point = self.evaluate(theta, near)
+        return point, 2.0 / self.size * self.linearise_at(point, reduce=False).adjoint(
+            point.residual
+        )
 
     def minibatches(self, epoch: int) -> list[Problem]:
         """Problems of some ``BATCH`` records each, drawn anew in each epoch; of few records, this.
@@ -240,7 +278,7 @@ class Problem(LeastSquares):
                 [drawn[(drawn >= a) & (drawn < b)] - a for a, b in itertools.pairwise(firsts)]
             )
             part._terms = [part.errors, *(ridge.part(parts) for ridge in ridges)]
-            part._reduced, part._checked = None, set()
+            part._checked = set()
             found.append(part)
         return found
 
@@ -251,30 +289,21 @@ class Problem(LeastSquares):
 
     def state_dict(self) -> dict[str, Tensor]:
         """What the next evaluations depend on besides θ, to the last bit."""
-        tensors = {"start": self._theta_0}
-        for number, term in enumerate(self._terms):
-            tensors |= {f"{number}.{name}": part for name, part in term.state_dict().items()}
-        if self._reduced is not None:
-            tensors["kept"] = self._reduced.kept
-        return tensors
+        kept = {} if self._reduced is None else {"kept": self._reduced.kept}
+        return {"start": self.theta, **kept}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Take over what the same problem had."""
-        theta_0 = tensors["start"]
-        if theta_0.shape != self._theta_0.shape or not torch.allclose(
-            theta_0, self._theta_0, 1e-6, 1e-6
-        ):
+        start = tensors["start"]
+        same = start.shape == self.theta.shape
+        if not same or not torch.allclose(start, self.theta, 1e-6, 1e-6):
             raise InputError(
                 "the fit that is to go on began elsewhere: the data, the settings or the package "
                 "have changed since. Start a new one, from its best model: init_from=DIR."
             )
-        for number, term in enumerate(self._terms):
-            own = f"{number}."
-            term.load_state_dict(
-                {n.removeprefix(own): part for n, part in tensors.items() if n.startswith(own)}
-            )
+        self.theta.copy_(start)  # of a ridge, too
         if "kept" in tensors:
-            self._reduced = Reduction(tensors["kept"], theta_0.new_zeros(0, len(theta_0)))
+            self._reduced = Reduction(tensors["kept"], None)
 
 
 def _errors_of(
@@ -317,8 +346,7 @@ def _check_measured(model: Model) -> None:
         if cell.get_parameter(name).numel()
         and not (name in cell.fixed and bool(cell.fixed[name].all()))
     ]
-    parts = known_parts(cell.static)
-    if free or (parts is not None and parts[0].outputs_have_parameters):
+    if free or cell.map.outputs_have_parameters:
         raise InputError(
             "start='measured' takes the states from the output, whose equation is to be fitted.\n"
             "Give a known model whose outputs are states, without parameters, or the matrices "

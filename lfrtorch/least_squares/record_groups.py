@@ -17,8 +17,8 @@ from torch.nn.functional import pad
 
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
-from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.initial_state import measured_start
+from lfrtorch.engine.weights import Weights
 from lfrtorch.records import NormalisedRecord, Record, Start
 
 EVERY = slice(None)
@@ -93,9 +93,9 @@ class RecordGroup:
 
 
 def group_records(
-    records: Sequence[NormalisedRecord], cell: LFRCell, ranks: Ranks
+    records: Sequence[NormalisedRecord], model: Weights, ranks: Ranks
 ) -> list[RecordGroup]:
-    """A process's share of the records, grouped, as tensors like the weights of the cell."""
+    """A process's share of the records, grouped, as tensors like the numbers of the model."""
     members: dict[tuple[int, Start, bool], list[NormalisedRecord]] = defaultdict(list)
     estimated: dict[tuple[int, Start, bool], list[int]] = defaultdict(list)
     count = itertools.count()
@@ -107,14 +107,14 @@ def group_records(
     groups = []
 
     def stacked(arrays: list[NDArray]) -> Tensor:
-        return torch.tensor(np.stack(arrays)).to(cell.A)
+        return torch.tensor(np.stack(arrays)).to(model.flat)
 
     def start_states(start: Start, group: Sequence[NormalisedRecord]) -> Tensor | None:
         if start == "given":
             return stacked([each.record.x0 for each in group if each.record.x0 is not None])
         if start == "measured":  # the same at every θ: the output's equation is not fitted
             first = [(each.u[0], each.y[0]) for each in group]
-            return measured_start(cell, *(stacked(list(s)) for s in zip(*first, strict=True)))
+            return measured_start(model, *(stacked(list(s)) for s in zip(*first, strict=True)))
         return None
 
     for kind, group in members.items():

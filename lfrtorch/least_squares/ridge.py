@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
-from lfrtorch.least_squares.term import PenaltyRows, Term
+from lfrtorch.least_squares.term import PenaltyRows, Seen, Term
 
 Ridge = float | Mapping[str, float]
 """One number, or one for each group of parameters by the beginning of their names,
@@ -28,25 +28,19 @@ class RidgePenalty(Term):
     def __init__(self, ridge: Float[Tensor, " P"], theta_0: Float[Tensor, " P"]) -> None:
         self._root, self._theta_0 = ridge.to(theta_0).sqrt(), theta_0
 
-    def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
+    def evaluate(self, theta: Float[Tensor, " P"], near: Seen | None = None) -> tuple[Tensor, Seen]:
         """r at θ."""
-        return self._root * (theta - self._theta_0)
+        return self._root * (theta - self._theta_0), ()
 
-    def linearise(self, theta: Float[Tensor, " P"], *, eliminate: bool) -> list[PenaltyRows]:
+    def linearise(
+        self, theta: Float[Tensor, " P"], seen: Seen, *, eliminate: bool
+    ) -> list[PenaltyRows]:
         """The rows of dr/dθ, a diagonal matrix."""
-        return [PenaltyRows(self._root, self.residual(theta))]
+        return [PenaltyRows(self._root, self._root * (theta - self._theta_0))]
 
     def part(self, count: int) -> RidgePenalty:
         """The penalty beside one of so many parts of the data."""
         return RidgePenalty(self._root.square() / count, self._theta_0)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """θ_0."""
-        return {"start": self._theta_0}
-
-    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over θ_0."""
-        self._theta_0 = tensors.get("start", self._theta_0)
 
 
 def ridge_by_entry(ridge: Ridge, sizes: Mapping[str, int]) -> Float[Tensor, " P"]:

@@ -7,52 +7,76 @@ system that a one-step predictor stands for, as a function of the predictor's pa
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from copy import copy, deepcopy
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.utils import vector_to_parameters
 
+from lfrtorch._support.threads import has_kernels
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.initial_state import estimated_start, start_from_beginning
 from lfrtorch.engine.innovation import split_predictor, split_weights
 from lfrtorch.engine.sensitivity import Linearisation
-from lfrtorch.engine.simulation import Trajectory, is_compiled, simulate, steady_state
-from lfrtorch.least_squares.jacobian import MappedRows, Memory, OutputRows
+from lfrtorch.engine.simulation import Trajectory, simulate, steady_state
+from lfrtorch.engine.weights import Weights
+from lfrtorch.least_squares.output_rows import MappedRows, Memory, OutputRows
 from lfrtorch.least_squares.record_groups import group_records
+from lfrtorch.least_squares.term import Seen
 from lfrtorch.records import NormalisedRecord
 
 
 class Parameters:
-    """θ: the parameters of a cell that require a gradient, then initial states of records."""
+    """θ: the free numbers of a model in their order, then initial states of records."""
+
+    # On the CPU θ and all that is computed from it are float64, whatever the cell is.
 
     def __init__(self, cell: LFRCell, states: int) -> None:
+        W = cell.weights()
+        self.layout, self.states = W.layout, states
+        self._flat = W.flat.double() if has_kernels(W.flat) else W.flat
+        self._free = torch.from_numpy(self.layout.free).to(W.flat.device)
+        self.own = len(self._free)
+        """Number of entries before the initial states."""
         self.sizes = {n: p.numel() for n, p in cell.named_parameters() if p.requires_grad}
         """Entries of each parameter, and of the initial states if there are any."""
-        self.names, self.own = list(self.sizes), sum(self.sizes.values())
-        """Names of the cell's parameters, and their entries, before those of initial states."""
-        self.states, self._nx = states, cell.nx
+        self.names = list(self.sizes)
         if states:
             self.sizes["x0"] = states * cell.nx
 
-    def of(self, cell: LFRCell, initial_states: Float[Tensor, "states nx"]) -> Float[Tensor, " P"]:
-        """θ of the weights of a cell and initial states."""
-        own = [cell.get_parameter(name).detach().flatten() for name in self.names]
-        return torch.cat([*own, initial_states.flatten()])
+    @property
+    def start(self) -> Float[Tensor, " own"]:
+        """θ of the cell that was given, without initial states."""
+        return self._flat[self._free]
+
+    def weights(self, theta: Float[Tensor, " P"]) -> Weights:
+        """The numbers of the model at θ."""
+        if self.own == len(self._flat):
+            return Weights(self.layout, theta[: self.own])
+        flat = self._flat.clone()
+        flat[self._free] = theta[: self.own]
+        return Weights(self.layout, flat)
 
     def initial_states(self, theta: Float[Tensor, " P"]) -> Float[Tensor, "states nx"]:
         """The initial states in θ."""
-        return theta[self.own :].view(self.states, self._nx)
+        return theta[self.own :].view(self.states, self.layout.sizes[0])
+
+    def read(self, cell: LFRCell) -> Float[Tensor, " own"]:
+        """θ of a cell, without initial states."""
+        free = [p.detach().flatten() for p in cell.parameters() if p.requires_grad]
+        return torch.cat([self._flat[:0], *(p.to(self._flat) for p in free)])
 
     def write(self, cell: LFRCell, theta: Float[Tensor, " P"]) -> None:
-        """Put θ into a cell, whose weights are views of it from then on."""
-        weights = [cell.get_parameter(name) for name in self.names]
-        vector_to_parameters(theta[: self.own].detach().to(cell.A), weights)
+        """Put θ into a cell."""
+        free = [p for p in cell.parameters() if p.requires_grad]
+        parts = theta[: self.own].detach().split([p.numel() for p in free])
+        with torch.no_grad():
+            for p, part in zip(free, parts, strict=True):
+                p.copy_(part.view_as(p))
 
 
 class SimulationErrors:
@@ -73,90 +97,63 @@ class SimulationErrors:
         solve_initial_states: bool = False,
     ) -> None:
         cell.check()
-        self._cell, self.ranks, self._y_scale = deepcopy(cell), ranks, y_scale
+        self.ranks, self._y_scale = ranks, y_scale
         self._solved = solve_initial_states
-        self.groups = group_records(records, self._cell, ranks)
-        self.size = sum(int(each.record.scored.sum()) for each in records)
         estimated = sum(each.record.start == "estimated" for each in records)
         self.parameters = Parameters(cell, 0 if solve_initial_states else estimated)
+        start = self.parameters.weights(self.parameters.start)
+        self.groups = group_records(records, start, ranks)
+        self.size = sum(int(each.record.scored.sum()) for each in records)
         self._memory = Memory()
-        self._guesses: list[Tensor | None] = [None] * len(self.groups)
-        """States of each group at a θ close to the next one."""
-        self._starts: list[Tensor | None] = [None] * len(self.groups)
-        """Initial states of each group that were solved for last."""
-        self._written: Tensor | None = None
-        """The θ whose weights the cell has."""
-        # A search evaluates r at a θ and, if it accepts it, J there: one simulation serves both.
-        self._latest: tuple[Tensor, list[Trajectory]] | None = None
 
-    def cell_at(self, theta: Float[Tensor, " P"]) -> LFRCell:
-        """The model with the weights in θ, until the next call."""
-        if self._written is None or not torch.equal(self._written, theta):
-            self._written = theta.clone()
-            self.parameters.write(self._cell, self._written)
-        return self._cell
-
-    def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
-        """Weighted errors at θ; infinite or NaN if the model diverges."""
-        errors = []
-        for group, trajectory in zip(self.groups, self.trajectories(theta), strict=True):
+    def evaluate(self, theta: Float[Tensor, " P"], near: Seen | None = None) -> tuple[Tensor, Seen]:
+        """Weighted errors at θ, infinite or NaN if the model diverges, and the trajectories."""
+        errors, seen = [], self._simulated(theta, near)
+        for group, trajectory in zip(self.groups, seen, strict=True):
             y_hat = group.shown(trajectory.y) if self._solved else trajectory.y
             errors.append(group.counted(y_hat).weigh(y_hat - group.y).flatten())
-        return torch.cat(errors)
+        return errors[0] if len(errors) == 1 else torch.cat(errors), seen
 
-    def linearise(self, theta: Float[Tensor, " P"], *, eliminate: bool = False) -> list[OutputRows]:
+    def linearise(
+        self, theta: Float[Tensor, " P"], seen: Seen, *, eliminate: bool = False
+    ) -> list[OutputRows]:
         """The rows of each group at θ; ``eliminate``: without columns of initial states."""
-        trajectories = self.trajectories(theta)
-        self._guesses = [t.x for t in trajectories]
-        cell, own, rows = self.cell_at(theta), self.parameters.own, []
-        for group, trajectory in zip(self.groups, trajectories, strict=True):
+        W, own, rows = self.parameters.weights(theta), self.parameters.own, []
+        for group, trajectory in zip(self.groups, seen, strict=True):
             x0 = group.estimated if self.parameters.states else None
             if x0 is not None:
-                x0 = own + cell.nx * x0.unsqueeze(1) + torch.arange(cell.nx)
+                x0 = own + W.nx * x0.unsqueeze(1) + torch.arange(W.nx)
             periodic = group.start == "periodic"
-            linearisation = Linearisation(cell, group.u, trajectory, periodic=periodic)
+            linearisation = Linearisation(W, group.u, trajectory, periodic=periodic)
             counted = group.counted(trajectory.y)
             rows.append(OutputRows(counted, linearisation, x0, self._memory, eliminate=eliminate))
         return rows
 
-    def rmse(self, theta: Float[Tensor, " P"]) -> float:
-        """RMSE at θ over scored samples and outputs, unweighted, in output units, as in a score."""
-        total = torch.zeros((), dtype=torch.float64, device=theta.device)
-        scale = torch.as_tensor(self._y_scale).to(theta)
-        for group, trajectory in zip(self.groups, self.trajectories(theta), strict=True):
+    def rmse(self, seen: Seen) -> float:
+        """RMSE over scored samples and outputs, unweighted, in output units, as in a score."""
+        total = 0.0
+        for group, trajectory in zip(self.groups, seen, strict=True):
+            scale = torch.as_tensor(self._y_scale).to(group.y)
             errors = (group.shown(trajectory.y) - group.y) * scale * group.scored
-            total = total + errors.double().square().sum()
-        return math.sqrt(self.ranks.sum(total) / self.size)
+            total += errors.double().square().sum()
+        return math.sqrt(self.ranks.sum(torch.as_tensor(total)) / self.size)
 
-    def trajectories(self, theta: Float[Tensor, " P"]) -> list[Trajectory]:
-        """Trajectories of each group at θ; those of the latest θ are cached."""
-        if self._latest is None or not torch.equal(self._latest[0], theta):
-            self._latest = None  # free its memory first
-            found = [self._trajectory(i, theta) for i in range(len(self.groups))]
-            self._latest = theta.clone(), found
-        return self._latest[1]
-
-    def _trajectory(self, i: int, theta: Float[Tensor, " P"]) -> Trajectory:
-        """The trajectory of a group at θ."""
-        group, x0 = self.groups[i], self._initial_state(i, theta)
-        cell = self.cell_at(theta)  # whose sizes and dtype θ cannot change: no check
-        if group.start == "periodic":
-            return steady_state(cell, group.u, self._guesses[i])
-        x0 = group.u.new_zeros(len(group.u), cell.nx) if x0 is None else x0
-        return simulate(cell, group.u, x0, guess=self._guesses[i])
-
-    def _initial_state(self, i: int, theta: Float[Tensor, " P"]) -> Float[Tensor, "R nx"] | None:
-        """Initial states of group i at θ, unless they are zero or periodic."""
-        group = self.groups[i]
-        if group.estimated is None:
-            return group.x0
-        if self._solved:
-            assert group.start_weight is not None
-            cell, near = self.cell_at(theta), self._starts[i]
-            found = estimated_start(cell, group.u, group.y, group.start_weight, near)
-            self._starts[i] = found
-            return found
-        return self.parameters.initial_states(theta)[group.estimated]
+    def _simulated(self, theta: Float[Tensor, " P"], near: Seen | None) -> tuple[Trajectory, ...]:
+        """The trajectory of each group at θ, from the states near it."""
+        W, found = self.parameters.weights(theta), []
+        for i, group in enumerate(self.groups):
+            states = None if near is None else near[i].x
+            if group.start == "periodic":
+                found.append(steady_state(W, group.u, states))
+                continue
+            x0 = group.x0
+            if group.start_weight is not None and self._solved:
+                first = None if states is None else states[:, 0]
+                x0 = estimated_start(W, group.u, group.y, group.start_weight, first)
+            elif group.estimated is not None:
+                x0 = self.parameters.initial_states(theta)[group.estimated]
+            found.append(simulate(W, group.u, x0, guess=states))
+        return tuple(found)
 
     def part(self, chosen: Sequence[Int[Tensor, " n"]]) -> SimulationErrors:
         """The errors of some records of each group, as functions of the same θ."""
@@ -164,42 +161,25 @@ class SimulationErrors:
         pairs = zip(self.groups, chosen, strict=True)
         found.groups = [group.part(records) for group, records in pairs if len(records)]
         found.size = int(sum(group.scored.sum() for group in found.groups))
-        found._cell, found._memory = deepcopy(self._cell), Memory()
-        found._guesses, found._starts = [None] * len(found.groups), [None] * len(found.groups)
-        found._written = found._latest = None
+        found._memory = Memory()
         return found
 
-    def first_initial_states(self) -> Float[Tensor, "states nx"]:
-        """Initial states in θ that fit best at the weights that were given."""
-        cell = self._cell
-        states = cell.A.new_zeros(self.parameters.states, cell.nx)
-        for group in self.groups if len(states) else ():
+    def first_theta(self) -> Float[Tensor, " P"]:
+        """θ of the cell that was given, with the initial states that fit best."""
+        start = self.parameters.start
+        W, count = self.parameters.weights(start), self.parameters.states
+        states = start.new_zeros(count, W.nx)
+        for group in self.groups if count else ():
             if group.estimated is not None:
                 weight = group.weight
                 if group.beyond is not None:
                     weight = weight * (group.beyond == 0)
-                states[group.estimated] = start_from_beginning(cell, group.u, group.y, weight)
-        return self.ranks.sum(states)
+                states[group.estimated] = start_from_beginning(W, group.u, group.y, weight)
+        return torch.cat([start, self.ranks.sum(states).flatten()])
 
     def release(self) -> None:
-        """Free the memory of what only speeds up the next evaluation."""
-        self._latest, self._memory = None, Memory()
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """What the next evaluations depend on besides θ, to the last bit."""
-        tensors = {}
-        for i, (group, guess) in enumerate(zip(self.groups, self._guesses, strict=True)):
-            if guess is not None:  # machine code needs the initial state of a period alone
-                compiled = is_compiled(self._cell, group.u)
-                tensors[f"guess.{i}"] = guess[:, :1] if compiled else guess
-        tensors |= {f"solved.{i}": x for i, x in enumerate(self._starts) if x is not None}
-        return tensors
-
-    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what the same term had."""
-        self._guesses = [tensors.get(f"guess.{i}") for i in range(len(self.groups))]
-        self._starts = [tensors.get(f"solved.{i}") for i in range(len(self.groups))]
-        self._latest = None
+        """Free the memory of rows."""
+        self._memory = Memory()
 
 
 class SystemErrors:
@@ -229,29 +209,24 @@ class SystemErrors:
             solve_initial_states=solve_initial_states,
         )
 
-    def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
-        """Weighted errors at φ(θ)."""
-        return self.weight * self._errors.residual(self._system_theta(theta))
+    def evaluate(self, theta: Float[Tensor, " P"], near: Seen | None = None) -> tuple[Tensor, Seen]:
+        """Weighted errors at φ(θ), and the trajectories."""
+        residual, seen = self._errors.evaluate(self._system_theta(theta), near)
+        return self.weight * residual, seen
 
-    def linearise(self, theta: Float[Tensor, " P"], *, eliminate: bool = False) -> list[MappedRows]:
+    def linearise(
+        self, theta: Float[Tensor, " P"], seen: Seen, *, eliminate: bool = False
+    ) -> list[MappedRows]:
         """The rows of each group at θ: those of the system times dφ/dθ."""
         steps = torch.eye(len(theta)).to(theta)
         # φ is quadratic, so that this difference is its derivative.
         change = (self._system_theta(theta + steps) - self._system_theta(theta - steps)).mT / 2.0
-        rows = self._errors.linearise(self._system_theta(theta))
+        rows = self._errors.linearise(self._system_theta(theta), seen)
         return [MappedRows(part, change, self.weight) for part in rows]
 
     def release(self) -> None:
-        """Free the memory of what only speeds up the next evaluation."""
+        """Free the memory of rows."""
         self._errors.release()
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """What the next evaluations depend on besides θ, to the last bit."""
-        return self._errors.state_dict()
-
-    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what the same term had."""
-        self._errors.load_state_dict(tensors)
 
     def _system_theta(self, theta: Float[Tensor, "*axes n"]) -> Float[Tensor, "*axes m"]:
         """φ of the free parameters at the beginning of θ, then the initial states in θ."""

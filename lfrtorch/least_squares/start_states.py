@@ -15,8 +15,10 @@ References:
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -72,17 +74,28 @@ class Eliminator:
         return StartStates(self._place.to(s.device), s, Vh, A, r)
 
     def _eliminate(self, rows: Float[Tensor, "R m columns"]) -> None:
-        nx = self._place.shape[1]
-        A, B, r = rows.split([rows.shape[2] - nx - 1, nx, 1], dim=2)
-        A = torch.cat([A, r], dim=2)
+        nx, columns = self._place.shape[1], rows.shape[2]
         if rows.shape[1] < nx:
-            A, B = (torch.nn.functional.pad(t, (0, 0, 0, nx - rows.shape[1])) for t in (A, B))
+            rows = torch.nn.functional.pad(rows, (0, 0, 0, nx - rows.shape[1]))
+        B = rows[..., columns - nx - 1 : -1]
         if not torch.isfinite(B).all():
-            A, B = torch.full_like(A, torch.nan), torch.zeros_like(B)
+            rows, B = torch.full_like(rows, torch.nan), torch.zeros_like(B)
         U, s, Vh = torch.linalg.svd(B, full_matrices=False)
-        seen = U.mT @ A
-        self._total.fold((A - U @ seen).flatten(0, 1))
-        self._found.append((s, Vh, seen[..., :-1], seen[..., -1]))
+        seen = _products(U.mT, rows)
+        # Of B nothing is left, so that its columns may stay among the others.
+        part = type(self._total)()
+        part.fold((rows - _products(U, seen)).flatten(0, 1))
+        place = torch.arange(columns, device=rows.device)
+        kept = torch.cat([place[: columns - nx - 1], place[-1:]])
+        self._total.add_columns(part, kept)
+        self._found.append((s, Vh, seen[..., : columns - nx - 1], seen[..., -1]))
+
+
+def _products(left: Float[Tensor, "R m k"], right: Float[Tensor, "R k n"]) -> Tensor:
+    """Products of small matrices, by numpy on the CPU: three times faster for many."""
+    if left.device.type != "cpu":
+        return left @ right
+    return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))
 
 
 class EliminatedSystem:
@@ -107,11 +120,16 @@ class EliminatedSystem:
         self._truncation = truncation
         self._latest: tuple[float, SVDSystem | Tensor] | None = None
         whole = (left if gram else left.mT @ left) + self._A.mT @ self._A + self._ridge.diag()
-        self.scale, self.rank = float("nan"), P + states.s.numel()
-        if torch.isfinite(whole).all():
-            # JᵀJ's largest eigenvalue is at most that of φ's block plus that of the states'.
-            largest = float(states.s.square().max()) + self._own
-            self.scale = max(largest_eigenvalue(whole), largest)
+        self._whole, self.rank = whole, P + states.s.numel()
+        # JᵀJ's largest eigenvalue is at most that of φ's block plus that of the states'.
+        self._largest = float(states.s.square().max()) + self._own
+        self.size = max(float(torch.linalg.matrix_norm(whole)), self._largest)
+
+    @property
+    def scale(self) -> float:
+        """Largest eigenvalue of JᵀJ, or at least half of it; NaN if an entry is not finite."""
+        finite = math.isfinite(self.size)
+        return max(largest_eigenvalue(self._whole), self._largest) if finite else float("nan")
 
     def solve(self, gradient: Float[Tensor, " all"], damping: float) -> Float[Tensor, " all"]:
         """-(JᵀJ + λI)⁻¹ gradient."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -12,6 +12,9 @@ from torch import Tensor
 from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator
 from lfrtorch.least_squares.start_states import StartStates
 
+Seen = tuple[Any, ...]
+"""What a term found at a θ and linearises about: tuples of tensors, as trajectories."""
+
 
 class Term(Protocol):
     """One summand |r(θ)|² of a problem."""
@@ -19,25 +22,21 @@ class Term(Protocol):
     eliminates: bool = True
     """Whether initial states can be eliminated from its rows."""
 
-    def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
-        """r at θ; infinite or NaN where it is undefined."""
+    def evaluate(self, theta: Float[Tensor, " P"], near: Seen | None = None) -> tuple[Tensor, Seen]:
+        """r at θ, infinite or NaN where it is undefined, and what else is known there.
+
+        ``near`` is what was seen at a θ close by, which may save time.
+        """
         ...
 
     def linearise(
-        self, theta: Float[Tensor, " P"], *, eliminate: bool
+        self, theta: Float[Tensor, " P"], seen: Seen, *, eliminate: bool
     ) -> Sequence[TermRows | PenaltyRows]:
         """The rows of dr/dθ at θ; ``eliminate``: initial states are eliminated from them."""
         ...
 
     def release(self) -> None:
-        """Free the memory of what only speeds up the next evaluation."""
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """What the next evaluations depend on besides θ, to the last bit."""
-        return {}
-
-    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what the same term had."""
+        """Free memory that only speeds up the next call."""
 
 
 class TermRows(Protocol):

@@ -147,12 +147,14 @@ class _GramSystem:
     """Normal equations JᵀJ = G in a basis Q of the directions that change the response."""
 
     def __init__(self, G: Float[Array, "K K"], Q: Float[Array, "P K"]) -> None:
-        self.scale, self.rank = float("nan"), 0
+        self.scale = self.size = float("nan")
+        self.rank = 0
         if np.isfinite(G).all():
             squares, axes = np.linalg.eigh(G)
             kept = squares > 1e-14 * squares[-1]  # the others are rounding errors
             self._squares, self._axes = squares[kept], Q @ axes[:, kept]
-            self.scale, self.rank = float(squares[-1]), int(kept.sum())
+            self.scale = self.size = float(squares[-1])
+            self.rank = int(kept.sum())
 
     def solve(self, gradient: Tensor, damping: float) -> Tensor:
         """-(JᵀJ + λI)⁻¹ gradient."""

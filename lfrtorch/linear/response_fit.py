@@ -313,7 +313,7 @@ class ResponseJacobian:
         self._more: Excess | None = None
         self._residual, self._poles = r, len(e)
         if e.any():
-            gradient = reduced.expand.mT @ (self._rows.mT @ r)
+            gradient = reduced.gradient(self._rows.mT @ r)
             self._more = Excess(*excess, float(torch.linalg.norm(r)), gradient.numpy())
             rows = torch.as_tensor(self._more.jacobian)[:, reduced.kept]
             self._rows = torch.cat([self._rows, rows])
@@ -326,7 +326,7 @@ class ResponseJacobian:
 
     def tangent(self, d_theta: Tensor) -> Tensor:
         """J d_theta."""
-        found = self._rows @ (self._reduced.expand @ d_theta)
+        found = self._rows @ self._reduced.reduced(d_theta)
         return found if self._more else torch.cat([found, found.new_zeros(self._poles)])
 
     def adjoint(self, residual: Tensor) -> Tensor:
@@ -334,7 +334,7 @@ class ResponseJacobian:
         return self._adjoint(residual if self._more else residual[: len(residual) - self._poles])
 
     def _adjoint(self, residual: Tensor) -> Tensor:
-        return self._reduced.expand.mT @ (self._rows.mT @ residual)
+        return self._reduced.gradient(self._rows.mT @ residual)
 
     def covariance(self, data: SpectralData, *, known: bool) -> Array:
         """Covariance (P, P) of θ at the minimum, see ``ResponseProblem.covariance``."""
@@ -343,7 +343,7 @@ class ResponseJacobian:
             return inverse / 2  # a complex error of variance 1 has real parts of variance 1/2
         # Sandwich (JᴴJ)⁻¹ cov(Σ s) (JᴴJ)⁻¹ with the scores s = Re(Jᴴ r) of the lines.
         J = self._J.reshape(len(self._J), -1, self._J.shape[-1]).conj()
-        expand = self._reduced.expand.numpy() @ inverse
+        expand = self._reduced.reduced(torch.from_numpy(inverse)).numpy()
 
         def scores(r: Complex) -> Complex:
             return np.einsum("fek,fe->fk", J, r.reshape(J.shape[:2])) @ expand

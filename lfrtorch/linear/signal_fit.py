@@ -27,7 +27,7 @@ from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.simulation_errors import SimulationErrors
-from lfrtorch.least_squares.term import Term, TermRows
+from lfrtorch.least_squares.term import Seen, Term, TermRows
 from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
 from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_signals
@@ -81,14 +81,13 @@ class SignalFit:
         matrices = A, np.zeros((nx, nu)), C, np.zeros((ny, nu))
         problem = self._problem(matrices, np.zeros((nx, ny)), observed=False)
         cell = problem.lfr.cell
-        cost = problem.cost(problem.residual(problem.theta))
+        at = problem.evaluate(problem.theta)
+        cost = at.cost
         if np.isfinite(cost):
-            system, gradient = problem.linearise(problem.theta, eliminate=False).system(
-                0.0, TRUNCATION
-            )
+            system, gradient = problem.linearise_at(at, eliminate=False).system(0.0, TRUNCATION)
             if np.isfinite(system.scale):
                 theta = problem.theta + system.solve(gradient, 0.0)
-                cost = problem.cost(problem.residual(theta))
+                cost = problem.evaluate(theta).cost
                 problem.write(theta)
         B, D = (m.detach().numpy()[:, :nu].copy() for m in (cell.Bu, cell.Dyu))
         return (cost if np.isfinite(cost) else np.inf), (A, B, C, D)
@@ -109,7 +108,7 @@ class SignalFit:
             variances = self.state_deviation(matrices) ** 2
             gains += [self._observer(matrices, part * variances) for part in OBSERVERS]
         problems = [self._problem(matrices, K) for K in gains]
-        problem = min(problems, key=lambda p: p.cost(p.residual(p.theta)))
+        problem = min(problems, key=lambda p: p.evaluate(p.theta).cost)
         return Search(problem, problem.theta)
 
     def unstable(self, found: Refined, max_iter: int) -> Refined:
@@ -158,7 +157,7 @@ class SignalFit:
                 driven = K @ constant + Bu[:, -1]
                 at_rest = np.linalg.solve(np.eye(len(A)) - A - K @ C, driven)
                 constant = np.asarray(constant + C @ at_rest, dtype=np.float64)
-        system, _ = problem.linearise(state.theta, eliminate=False).system(0.0, TRUNCATION)
+        system, _ = problem.linearise_at(state.point, eliminate=False).system(0.0, TRUNCATION)
         assert isinstance(system, SVDSystem)
         covariance = None
         if state.iteration:
@@ -177,8 +176,7 @@ class SignalFit:
         )
         if not self._prediction:
             return found
-        trajectories = problem.errors.trajectories(state.theta)
-        pairs = zip(problem.errors.groups, trajectories, strict=True)
+        pairs = zip(problem.errors.groups, state.seen[0], strict=True)
         errors = torch.cat([(b.y - t.y)[b.scored[..., 0].bool()] for b, t in pairs])
         innovations = np.atleast_2d(np.cov(errors.numpy().T, bias=True))
         return replace(found, K=K, innovation_covariance=innovations)
@@ -291,13 +289,13 @@ class _PoleWall(Term):
     def __init__(self, errors: SimulationErrors, outputs: slice | None) -> None:
         self._errors, self._outputs = errors, outputs
 
-    def residual(self, theta: Tensor) -> Tensor:
-        cell = self._errors.cell_at(theta)
-        matrices = [cell.A.detach()]
+    def evaluate(self, theta: Tensor, near: Seen | None = None) -> tuple[Tensor, Seen]:
+        W = self._errors.parameters.weights(theta)
+        matrices = [W.A]
         if self._outputs is not None:
-            matrices.append((cell.A + cell.Bu[:, self._outputs] @ cell.Cy).detach())
+            matrices.append(W.A + W.Bu[:, self._outputs] @ W.Cy)
         stable = all(spectral_radius(A) < LARGEST_POLE for A in matrices)
-        return theta[:0] if stable else theta.new_full((1,), torch.inf)
+        return theta[:0] if stable else theta.new_full((1,), torch.inf), ()
 
-    def linearise(self, theta: Tensor, *, eliminate: bool) -> list[TermRows]:
+    def linearise(self, theta: Tensor, seen: Seen, *, eliminate: bool) -> list[TermRows]:
         return []

@@ -9,7 +9,7 @@ from reference import measure, normal, random_model
 
 from lfrtorch.analysis import canonical, structure
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.maps.network import Network
 from lfrtorch.model import Model
 
 pytestmark = pytest.mark.numeric

@@ -17,8 +17,8 @@ from torch.testing import assert_close
 import lfrtorch
 from lfrtorch.analysis import canonical
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network
-from lfrtorch.engine.simulation import is_compiled, simulate, steady_state
+from lfrtorch.engine.simulation import simulate, steady_state
+from lfrtorch.maps.network import Network
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -85,14 +85,19 @@ def test_it_is_the_same_model_with_a_map_of_no_slope_and_unit_covariances():
     model = strong()
     records = data(model)
     found = canonical(model, records)
-    trajectories = []
+    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = found.matrices
+    signals = []
     for record in records:
         y = found.model.simulate(record)
         np.testing.assert_allclose(y, record.y, rtol=0, atol=1e-10 * record.y.std())
-        trajectories.append(found.model.signals(record))
-    x, z, w = (
-        np.concatenate([getattr(t, name)[0].numpy() for t in trajectories]) for name in "xzw"
-    )
+        x, z = found.model.signals(record).x[0].numpy(), model.signals(record).z[0].numpy()
+        z, u = z @ found.Z.T, model.scaler.normalise_u(record.u)
+        w, y = found.static(z), (y - model.scaler.y_offset) / model.scaler.y_scale
+        np.testing.assert_allclose(x[1:], x[:-1] @ A.T + u @ Bu.T + w @ Bw.T, atol=1e-10)
+        np.testing.assert_allclose(z, x[:-1] @ Cz.T + u @ Dzu.T, atol=1e-10)
+        np.testing.assert_allclose(y, x[:-1] @ Cy.T + u @ Dyu.T + w @ Dyw.T, atol=1e-10)
+        signals.append((x, z, w))
+    x, z, w = (np.concatenate(each) for each in zip(*signals, strict=True))
     for signal in (x, z, w):
         covariance = np.cov(signal.T, bias=True)
         np.testing.assert_allclose(covariance, np.eye(len(covariance)), atol=1e-8)
@@ -107,9 +112,10 @@ def test_it_is_the_same_model_with_a_map_of_no_slope_and_unit_covariances():
 def test_it_is_compiled_saved_and_taken_apart_again(polynomial: bool, tmp_path: Path):
     model = random_model(polynomial_cell(2, 2, 3)) if polynomial else strong()
     record = measure(model, 80, seed=1)
-    found = canonical(model, record).model
+    form = canonical(model, record)
+    found = form.model
     cell, u = found.lfr.cell, torch.as_tensor(model.scaler.normalise_u(record.u))[None]
-    assert is_compiled(cell, u)
+    assert cell.map.code is not None
     x0 = normal(1, cell.nx)
     for one, other in zip(simulate(cell, u, x0), reference.simulate(cell, u, x0), strict=True):
         assert_close(one, other, rtol=0, atol=1e-10)
@@ -122,7 +128,8 @@ def test_it_is_compiled_saved_and_taken_apart_again(polynomial: bool, tmp_path: 
     assert again.net_parameter_count == model.net_parameter_count
     twice = canonical(found, record)
     np.testing.assert_allclose(twice.model.simulate(record), record.y, atol=1e-9)
-    np.testing.assert_allclose(np.abs(twice.Z), np.eye(cell.nz), atol=1e-6)
+    np.testing.assert_allclose(twice.X, np.eye(cell.nx), atol=1e-6)
+    np.testing.assert_allclose(twice.Z, form.Z, atol=1e-6)
 
 
 @pytest.mark.parametrize("change", ["first", "second", "linear"])
@@ -132,15 +139,11 @@ def test_the_same_model_in_other_weights_has_the_same_form(change: str):
     records = data(model)
     np.testing.assert_allclose(other.simulate(records[0]), records[0].y, atol=1e-10)
     one, two = (canonical(each, records) for each in (model, other))
-    cells = [each.model.lfr.cell for each in (one, two)]
-    for name in ("A", "Bu", "Bw", "Cz", "Dzu", "Cy", "Dyu", "Dyw"):
-        first, second = (cell.get_parameter(name).detach().numpy() for cell in cells)
+    for first, second in zip(one.matrices, two.matrices, strict=True):
         np.testing.assert_allclose(second, first, rtol=0, atol=1e-7 * max(np.abs(first).max(), 1.0))
-    z = normal(50, 2)
-    maps = [cell.static for cell in cells]
-    assert maps[0] is not None
-    assert maps[1] is not None
-    assert torch.allclose(maps[1](z), maps[0](z), rtol=0, atol=1e-6)
+    z = normal(50, 2).numpy()
+    np.testing.assert_allclose(two.static(z), one.static(z), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(two.slopes(z), one.slopes(z), rtol=0, atol=1e-6)
     np.testing.assert_allclose(two.shares, one.shares, atol=1e-9)
 
 

@@ -11,7 +11,7 @@ from reference import measure, random_cell, random_model
 
 import lfrtorch
 from lfrtorch.analysis.model_plots import most_nonlinear, static_figure, visited
-from lfrtorch.engine.nonlinearity import Polynomial
+from lfrtorch.maps.polynomial import Polynomial
 
 pytestmark = pytest.mark.numeric
 
@@ -59,12 +59,12 @@ def test_the_direction_that_bends_is_found_and_the_linear_part_is_taken_off():
                 cell.static.C[0, n] = products[i, j] * (1 if i == j else 2)
                 n += 1
     model = random_model(cell)
-    where = visited(model, cell, None)
-    at, share = most_nonlinear(cell, where, 0)
+    where = visited(model, cell.map, None)
+    at, share = most_nonlinear(cell.map, where, 0)
     assert share == pytest.approx(1.0, abs=1e-9)
     assert abs(np.corrcoef(at, where.z @ direction.numpy())[0, 1]) == pytest.approx(1.0)
     assert np.std(at) == pytest.approx(1.0, abs=1e-6)
-    known = visited(model, cell, [measure(model, 300), measure(model, 200, seed=1)])
+    known = visited(model, cell.map, [measure(model, 300), measure(model, 200, seed=1)])
     assert known.z.shape == (500, 3)
     assert (known.known, where.known) == (True, False)
     assert 0.0 < known.nonlinear[0] < 1.0

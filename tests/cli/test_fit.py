@@ -434,11 +434,12 @@ def test_the_mean_of_starts_is_a_model_of_the_run(csv: Path, tmp_path: Path):
     )
 
 
-def test_the_mean_is_of_networks(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_mean_is_of_other_maps_too(csv: Path, tmp_path: Path):
     settings = [*file_overrides(csv), "nx=1", "starts=2", "average=2", "trainer.max_iter=1"]
-    fit.run(configuration(*settings, "static=polynomial", "figures=false"), tmp_path)
-    assert "note: average is for networks" in capsys.readouterr().out
-    assert json.loads((tmp_path / "metrics.json").read_text())["averaged"] == 1
+    settings += ["static=polynomial", "figures=false", "data.validation=0"]
+    fit.run(configuration(*settings), tmp_path)
+    assert json.loads((tmp_path / "metrics.json").read_text())["averaged"] == 2
+    assert lfrtorch.load(tmp_path).sizes == {"nx": 2, "nz": 4, "nw": 2, "degree": 3}
 
 
 def test_a_new_run_forgets_the_one_that_it_replaces(csv: Path, tmp_path: Path):

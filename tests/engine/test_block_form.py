@@ -13,7 +13,7 @@ from reference import measure, random_cell, random_model
 import lfrtorch
 from lfrtorch.analysis import structure
 from lfrtorch.engine.block_form import IN_SERIES, zeros_of
-from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.maps.network import Network
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 

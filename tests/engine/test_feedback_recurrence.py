@@ -1,6 +1,8 @@
 """Recurrences without F(k) are those with it, in machine code and in torch."""
 
 from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -21,7 +23,7 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(threads, "COMPILED_ON", set())
 
 
-def weights(nx: int, nz: int, nw: int, dtype: torch.dtype):
+def weights(nx: int, nz: int, nw: int, dtype: torch.dtype) -> Any:
     """Random matrices of a stable model."""
     generator = torch.Generator().manual_seed(nx + nz)
     sizes = {"A": (nx, nx), "Bw": (nx, nw), "Cz": (nz, nx), "Cy": (1, nx), "Dyw": (1, nw)}
@@ -29,7 +31,7 @@ def weights(nx: int, nz: int, nw: int, dtype: torch.dtype):
         name: torch.randn(*size, generator=generator, dtype=dtype) for name, size in sizes.items()
     }
     found["A"] *= 0.5 / nx**0.5
-    return found
+    return SimpleNamespace(**found, nx=nx)
 
 
 @pytest.mark.parametrize(("nx", "nz", "nw"), [(1, 1, 1), (5, 2, 3), (9, 4, 2)])
@@ -39,7 +41,7 @@ def test_they_are_the_recurrences_of_the_products(nx: int, nz: int, nw: int, dty
     generator = torch.Generator().manual_seed(0)
     W = weights(nx, nz, nw, dtype)
     J = 0.3 * torch.randn(R, T, nw, nz, generator=generator, dtype=dtype)
-    J /= W["Bw"].norm() * W["Cz"].norm()
+    J /= W.Bw.norm() * W.Cz.norm()
     g = torch.randn(R, T, nx, generator=generator, dtype=dtype)
     s0 = torch.randn(R, nx, generator=generator, dtype=dtype)
     F = linearise_at(W, J).F
@@ -67,7 +69,8 @@ def test_what_has_faded_is_zero_and_what_overflows_is_not_finite():
     eye = torch.eye(3, dtype=torch.float64).unsqueeze(0)
     none = torch.zeros(1, 4000, 1, 1, dtype=torch.float64)
     assert transition(W, none, eye).abs().max() < 1e-30
-    assert not torch.isfinite(transition(W | {"A": 10.0 * eye[0]}, none, eye)).all()
+    growing: Any = SimpleNamespace(**vars(W) | {"A": 10.0 * eye[0]})
+    assert not torch.isfinite(transition(growing, none, eye)).all()
     assert (
         feedback_recurrence.states(W, none, torch.zeros(1, 4000, 3).double(), eye[:, 0])[0, -1]
         .abs()

@@ -1,5 +1,8 @@
 """Initial states that are estimated from the output: known ones, hidden ones, faded ones."""
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -9,12 +12,12 @@ from reference import POLES, normal, random_cell, special_poles
 from torch import Tensor
 from torch.testing import assert_close
 
-from lfrtorch.engine import initial_state
+from lfrtorch.engine import initial_state, sensitivity
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.initial_state import estimated_start, start_from_beginning
-from lfrtorch.engine.linearised import Linearised, linearise
-from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.engine.sensitivity import Linearisation, Rows
 from lfrtorch.engine.simulation import Trajectory, simulate, simulate_near
+from lfrtorch.maps.network import Network
 
 pytestmark = pytest.mark.numeric
 
@@ -71,12 +74,14 @@ def test_no_sample_is_looked_at_that_does_not_tell_the_initial_state(counted: in
     weight[:, counted:] = 0.0
     whole, looked_at = estimated_start(cell, u, y, weight), []
 
-    def watched(cell: LFRCell, z: Tensor) -> Linearised:
-        looked_at.append(z.shape[1])
-        return linearise(cell, z)
+    def watched(self: Linearisation, *given: Any, **named: Any) -> Iterator[Rows]:
+        for block in rows(self, *given, **named):
+            looked_at.append(block.time.stop)
+            yield block
 
-    monkeypatch.setattr(initial_state, "linearise", watched)
-    monkeypatch.setattr(initial_state, "BLOCK", 64)
+    rows = Linearisation.rows
+    monkeypatch.setattr(Linearisation, "rows", watched)
+    monkeypatch.setattr(sensitivity, "BLOCK", 64)
     assert_close(estimated_start(cell, u, y, weight), whole, rtol=0, atol=1e-8)
     assert set(looked_at) == {min(counted, 64)}
     # From rest, a few Gauss-Newton steps and as many in each pass of the prior, if it is needed.

@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 import lfrtorch.engine.newton
-from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linear_recurrence import linear_recurrence, scan
 from lfrtorch.engine.linearised import linearise as linearise_of
 from lfrtorch.engine.newton import newton_states
+from lfrtorch.maps.activations import ACTIVATIONS
 
 pytestmark = pytest.mark.numeric
 

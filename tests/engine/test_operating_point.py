@@ -7,8 +7,8 @@ from torch.func import jacrev
 from torch.testing import assert_close
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.engine.operating_point import equilibrium, linearised_at
+from lfrtorch.maps.polynomial import Polynomial
 
 pytestmark = pytest.mark.numeric
 

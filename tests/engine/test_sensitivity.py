@@ -13,10 +13,10 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from lfrtorch.engine import sensitivity
-from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.engine.simulation import simulate, steady_state
+from lfrtorch.maps.activations import ACTIVATIONS
 
 pytestmark = pytest.mark.numeric
 

@@ -13,18 +13,13 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lfrtorch.engine import simulation
-from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.feedback_recurrence import monodromy
 from lfrtorch.engine.linearised import linearise, spectral_radius
-from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.engine.simulation import (
-    PERIODIC_TOLERANCE,
-    Trajectory,
-    is_compiled,
-    simulate,
-    steady_state,
-)
+from lfrtorch.engine.simulation import PERIODIC_TOLERANCE, Trajectory, simulate, steady_state
+from lfrtorch.maps.activations import ACTIVATIONS
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.polynomial import Polynomial
 
 pytestmark = pytest.mark.numeric
 
@@ -91,7 +86,7 @@ def test_polynomial_is_compiled_and_the_plain_loop(
 ):
     cell = polynomial_cell(nz, nw, degree, dtype=dtype)
     u, x0 = normal(3, 20, 2, dtype=dtype), normal(3, 2, seed=1, dtype=dtype)
-    assert is_compiled(cell, u)
+    assert cell.weights().layout.compiled
     trajectory = simulate(cell, u, x0)
     assert trajectory.y.dtype == dtype
     assert_same(trajectory, reference.simulate(cell, u, x0), 1000 * torch.finfo(dtype).eps)

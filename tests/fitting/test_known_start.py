@@ -13,7 +13,6 @@ import lfrtorch
 from lfrtorch import Dataset, InputError, Known, Parameter, Record, Settings, State
 from lfrtorch.analysis import PhysicalParameters, canonical, physical_parameters, uncertainty
 from lfrtorch.analysis.model_plots import static_figure
-from lfrtorch.engine.nonlinearity import known_parts
 from lfrtorch.fitting.known_start import known_model, varied
 
 FS, DAMPING, GRAVITY = 20.0, 0.3, 5.0
@@ -139,9 +138,7 @@ def test_a_checkpoint_holds_the_equations(settings: dict[str, Any], tmp_path: Pa
     again = lfrtorch.load(tmp_path / "model")
     np.testing.assert_array_equal(again.simulate(train), model.simulate(train))
     assert again.lfr.cell.fixed.keys() == model.lfr.cell.fixed.keys()
-    parts = known_parts(again.lfr.cell.static)
-    assert parts is not None
-    np.testing.assert_array_equal(parts[0].bounds[0], [0.0, np.inf])
+    np.testing.assert_array_equal(again.lfr.cell.map.known.bounds[0], [0.0, np.inf])
     found = physical_parameters(again, train)
     assert isinstance(found, PhysicalParameters)
 
@@ -173,7 +170,7 @@ def test_other_features_work_with_it(settings: dict[str, Any]):
 
 def test_it_is_printed_with_its_parameters(both: lfrtorch.Run, grey: lfrtorch.Run):
     assert "2 known states, nx=0" in repr(both.model)
-    assert "KnownMap(angle, speed; damping=" in str(both.model)
+    assert "KnownModel(angle, speed; damping=" in str(both.model)
     assert "beside it   Network(nz=1, nw=1, nn=4" in str(both.model)
     assert "linear part" not in str(grey.model)
 
@@ -211,10 +208,9 @@ def test_starts_vary_within_the_bounds():
     linear = lfrtorch.estimate_bla(train, nx=2)
     model = known_model(known(parameters=narrow), linear, [train])
     for seed in range(5):
-        parts = known_parts(varied(model, seed).lfr.cell.static)
-        assert parts is not None
-        assert 0.25 - 1e-9 <= parts[0].physical["damping"] <= 0.35 + 1e-9
-        assert parts[0].physical["gravity"] != 0.0
+        values = varied(model, seed).lfr.cell.map.known.physical
+        assert 0.25 - 1e-9 <= values["damping"] <= 0.35 + 1e-9
+        assert values["gravity"] != 0.0
 
 
 @pytest.mark.parametrize(

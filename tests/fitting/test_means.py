@@ -9,17 +9,30 @@ import torch
 from reference import random_cell, random_model
 
 import lfrtorch
-from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.engine.cell import LFRCell
 from lfrtorch.fitting.means import mean_model
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.model import Model
 from lfrtorch.records import Start
 
 pytestmark = pytest.mark.numeric
 
 
-def models() -> list[Model]:
+class Sine(torch.nn.Linear):
+    """w = sin(W z + b), a module of the user's own."""
+
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
+        return torch.sin(super().forward(input))
+
+
+def models(*maps: torch.nn.Module) -> list[Model]:
     """Three of one data set, whose starts were drawn from three seeds."""
-    first, *others = (random_model(random_cell(2, 2, 3, 2, 1, 4, seed=seed)) for seed in (1, 2, 3))
+    maps = maps or tuple(Network(2, 1, 4) for _ in range(3))
+    first, *others = (
+        random_model(random_cell(2, 2, 3, 2, 1, seed=seed, static=static))
+        for seed, static in enumerate(maps, start=1)
+    )
     return [first, *(replace(other, scaler=first.scaler) for other in others)]
 
 
@@ -31,6 +44,41 @@ def test_mean_of_models_simulates_the_mean(start: Start):
     expected = np.mean([model.simulate(u, start=start) for model in several], axis=0)
     np.testing.assert_allclose(mean.simulate(u, start=start), expected, rtol=0, atol=1e-9)
     assert mean.sizes == {"nx": 9, "nz": 6, "nw": 3, "nn": 12}
+    assert repr(mean.lfr.cell.static) == "Network(nz=6, nw=3, nn=12, activation='tanh')"
+
+
+@pytest.mark.parametrize(
+    ("maps", "last"),
+    [
+        ([Network(2, 1, 4), Network(2, 1, 3, "relu"), Network(2, 1, 2)], {"nn": 9}),
+        ([Polynomial(2, 1, 2) for _ in range(3)], {"degree": 2}),
+        ([Sine(2, 1) for _ in range(3)], {"nn": 0}),
+    ],
+)
+def test_maps_that_are_no_network_together_stand_beside_each_other(
+    maps: list[torch.nn.Module], last: dict[str, int], tmp_path: Path
+):
+    several = models(*maps)
+    u = 0.3 * np.random.default_rng(0).normal(size=(200, 2))
+    mean = mean_model(several)
+    expected = np.mean([model.simulate(u) for model in several], axis=0)
+    np.testing.assert_allclose(mean.simulate(u), expected, rtol=0, atol=1e-9)
+    assert mean.sizes == {"nx": 9, "nz": 6, "nw": 3, **last}
+    folder = mean.save(tmp_path / "model")
+    if isinstance(maps[0], Sine):
+        with pytest.raises(ValueError, match="class Sine, which is not part of this package"):
+            lfrtorch.load(folder)
+    again = lfrtorch.load(folder, static=Sine(2, 1))
+    np.testing.assert_array_equal(again.simulate(u), mean.simulate(u))
+
+
+def test_mean_of_linear_models_is_linear():
+    several = [random_model(random_cell(nz=0, nw=0, seed=seed)) for seed in range(2)]
+    assert mean_model(several).lfr.cell.static is None
+    several[1] = replace(random_model(random_cell(seed=1)), scaler=several[0].scaler)
+    u = np.random.default_rng(0).normal(size=(50, 1))
+    expected = np.mean([model.simulate(u) for model in several], axis=0)
+    np.testing.assert_allclose(mean_model(several).simulate(u), expected, rtol=0, atol=1e-9)
 
 
 def test_mean_of_one_is_itself():
@@ -83,10 +131,7 @@ def test_mean_refuses_models_that_are_not_alike():
     several = models()
     with pytest.raises(ValueError, match="other channels, scales or rates"):
         mean_model([several[0], replace(several[1], fs=7.0)])
-    other = models()[1]
-    other.lfr.cell.static = Network(2, 1, 4, "relu", dtype=torch.float64)
-    with pytest.raises(ValueError, match="different activations"):
-        mean_model([several[0], other])
-    other.lfr.cell.static = Polynomial(2, 1, 3)
+    known = lfrtorch.Known(lambda x, u, p: (0.5 * x.h + u[0],), states=["h"], method="discrete")
+    cell = LFRCell(1, 1, 1, 2, 2, known.map(1, ["h"], 1.0), dtype=torch.float64)
     with pytest.raises(ValueError, match="average the simulated outputs"):
-        mean_model([several[0], other])
+        mean_model([random_model(cell)])

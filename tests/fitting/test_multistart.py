@@ -13,10 +13,11 @@ from reference import measure, move, planted, random_cell, random_model, theta, 
 from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
+import lfrtorch
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.threads import worth_threads
 from lfrtorch.distributed import Ranks
-from lfrtorch.engine.nonlinearity import Polynomial
+from lfrtorch.engine.cell import LFRCell
 from lfrtorch.fitting import side_by_side
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import Round, fit, iterations_of, schedule
@@ -316,10 +317,10 @@ def test_bad_calls_are_refused():
         fit(models, train, monitors=[[]])
     with pytest.raises(ValueError, match="average is 0"):
         fit(models, train, average=0)
-    models[1].lfr.cell.static = Polynomial(1, 1, 3, dtype=torch.float64)
-    with pytest.raises(ValueError, match="average is 2, and the mean is of models with a network"):
-        fit(models, train, average=2, trainer=Adam(max_iter=10**9))
-    assert fit(models, train, trainer=LevenbergMarquardt(max_iter=1)).averaged == 1
+    known = lfrtorch.Known(lambda x, u, p: (0.5 * x.h + u[0],), states=["h"], method="discrete")
+    cell = LFRCell(1, 1, 1, 2, 2, known.map(1, ["h"], 1.0), dtype=torch.float64)
+    with pytest.raises(ValueError, match="a mean of models has no parameters of its own"):
+        fit([random_model(cell)], train, average=2, trainer=Adam(max_iter=10**9))
 
 
 @pytest.mark.parametrize("judged_on", ["validation", "selection"])

@@ -114,7 +114,7 @@ def same(one: Any, other: Any) -> bool:
         return one.dtype == other.dtype and torch.equal(one, other)
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, list):
+    if isinstance(one, list | tuple):
         return len(one) == len(other) and all(map(same, one, other))
     return one == other or (isinstance(one, float) and math.isnan(one) and math.isnan(other))
 
@@ -380,7 +380,7 @@ def test_numbers_that_were_not_written(tmp_path: Path, name: str, old: bytes, ne
 
 def test_a_file_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with monkeypatch.context() as changed:
-        changed.setattr(state_file, "_FORMAT", "lfrtorch snapshot 3")
+        changed.setattr(state_file, "_FORMAT", "lfrtorch snapshot 0")
         run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=1))
     with pytest.raises(ValueError, match="another version"):
         run(starts(1), records(), tmp_path)

@@ -11,7 +11,6 @@ from reference import random_system
 from scipy.signal import butter, lfilter
 from torch import Tensor, nn
 
-from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.fitting import nonlinear_end
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
@@ -20,6 +19,8 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model, load
 from lfrtorch.records import Record
@@ -101,7 +102,7 @@ def test_signals_have_unit_deviation(bla: LinearModel, method):
     for start in (bla, bla.transformed(T)):
         model = initialise(start, RECORDS, **SIZES, method=method)
         problem = Problem.of(model, RECORDS)
-        trajectories = problem.errors.trajectories(problem.theta)
+        (trajectories,) = problem.evaluate(problem.theta).seen
         x = torch.cat([t.x[:, :-1].flatten(0, 1) for t in trajectories])
         z = torch.cat([t.z.flatten(0, 1) for t in trajectories])
         u = torch.cat([group.u.flatten(0, 1) for group in problem.errors.groups])

@@ -26,7 +26,7 @@ from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import EXPLOSION, Fit, Progress
 from lfrtorch.least_squares.adam import Adam
-from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, LevenbergMarquardt
+from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, LevenbergMarquardt, Point
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model, load
@@ -62,7 +62,7 @@ class Walk:
     @dataclass(frozen=True)
     class State:
         theta: Tensor
-        residual: Tensor
+        point: Point
         iteration: int = 0
         reason: str = ""
         report: Any = None
@@ -72,7 +72,7 @@ class Walk:
         return len(self.offsets)
 
     def init(self, problem: Any, theta: Tensor) -> State:
-        return self.State(theta, problem.residual(theta), report={})
+        return self.State(theta, problem.evaluate(theta), report={})
 
     def step(self, problem: Any, state: State) -> State:
         theta = state.theta.clone()
@@ -81,7 +81,7 @@ class Walk:
         return replace(
             state,
             theta=theta,
-            residual=problem.residual(theta),
+            point=problem.evaluate(theta),
             iteration=state.iteration + 1,
             reason=self.reason if last else "",
         )
@@ -399,8 +399,8 @@ def test_seconds_are_those_of_steps_and_their_judgement(monkeypatch):
 
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
     begun = Fit(*planted(T=20)[:2], trainer=Slow((STEP, STEP)))
-    judged = begun.problem.rmse
-    monkeypatch.setattr(begun.problem, "rmse", lambda theta: (passes(2.0), judged(theta))[1])
+    judged = begun.problem.rmse_at
+    monkeypatch.setattr(begun.problem, "rmse_at", lambda point: (passes(2.0), judged(point))[1])
     result = begun.advance(monitors=[lambda *_: passes(100.0)]).result()
     assert [p.seconds for p in result.history] == [6.0, 16.0, 26.0]
     assert (result.seconds, result.seconds_per_iteration) == (26.0, 8.0)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from lfrtorch.least_squares.adam import Adam, Differentiable
+from lfrtorch.least_squares.levenberg_marquardt import Point
 
 pytestmark = pytest.mark.numeric
 
@@ -14,10 +15,10 @@ pytestmark = pytest.mark.numeric
 class Quadratic(Differentiable):
     """r = (x - 1, 10 (y - 2))."""
 
-    def gradient(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+    def gradient(self, theta: Tensor, near: Point | None = None) -> tuple[Point, Tensor]:
         weight = theta.new_tensor([1.0, 10.0])
         r = weight * (theta - theta.new_tensor([1.0, 2.0]))
-        return r, weight * r  # of the mean square: 2/2 weight r
+        return Point(theta, r, float(r @ r)), weight * r  # of the mean square: 2/2 weight r
 
 
 ZERO = torch.zeros(2, dtype=torch.float64)
@@ -33,7 +34,7 @@ def test_steps_are_those_of_torch():
         parameter.grad = problem.gradient(parameter.detach())[1]
         theirs.step()
         assert torch.equal(state.theta, parameter)
-        assert torch.equal(state.residual, problem.gradient(parameter.detach())[0])
+        assert torch.equal(state.residual, problem.gradient(parameter.detach())[0].residual)
     assert (state.iteration, state.reason) == (20, "maximum number of epochs")
 
 
@@ -82,9 +83,9 @@ def test_report_is_the_norm_of_the_gradient():
 
 def test_divergence_is_a_reason():
     class Broken(Quadratic):
-        def gradient(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-            r, gradient = super().gradient(theta)
-            return (r, gradient) if not theta.any() else (r * torch.inf, gradient * torch.nan)
+        def gradient(self, theta: Tensor, near: Point | None = None) -> tuple[Point, Tensor]:
+            point, gradient = super().gradient(theta)
+            return point, gradient if not theta.any() else gradient * torch.nan
 
     adam = Adam()
     state = adam.step(Broken(), adam.init(Broken(), ZERO))

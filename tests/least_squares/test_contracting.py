@@ -8,7 +8,6 @@ import torch
 from reference import measure, normal, polynomial_cell, random_cell, random_model
 
 from lfrtorch import analysis
-from lfrtorch.engine.nonlinearity import Network
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.bounded_system import BoundedSystem
@@ -16,6 +15,7 @@ from lfrtorch.least_squares.contracting import Contracting, MarginBound
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import CholeskySystem
 from lfrtorch.least_squares.problem import Problem
+from lfrtorch.maps.network import Network
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.starts import initialise
@@ -15,6 +14,8 @@ from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.exact_integrators import fixed_parameters, integrating_states
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record

@@ -1,6 +1,6 @@
 """Columns that are left out are exactly those combinations of the others."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -9,12 +9,25 @@ from reference import SIZES, normal, random_cell
 from torch.testing import assert_close
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.engine.simulation import simulate, steady_state
-from lfrtorch.least_squares.gauge import reduction
+from lfrtorch.least_squares import gauge
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.polynomial import Polynomial
 
 pytestmark = pytest.mark.numeric
+
+
+class Reduced(NamedTuple):
+    """Columns that are kept, and what gives all."""
+
+    kept: torch.Tensor
+    expand: torch.Tensor
+
+
+def reduction(*given: Any, **named: Any) -> Reduced:
+    kept, expand = gauge.reduction(*given, **named)
+    return Reduced(kept, torch.eye(len(kept)).double() if expand is None else expand)
 
 
 def none(cell: LFRCell) -> torch.Tensor:
@@ -102,7 +115,7 @@ def test_weights_that_are_not_finite_leave_nothing_out():
     with torch.no_grad():
         cell.A[0, 0] = torch.inf
     kept, expand = reduction(cell, none(cell))
-    assert torch.equal(expand, torch.eye(len(kept), dtype=expand.dtype))
+    assert torch.equal(expand, torch.eye(len(kept)).double())
     fixed = entries(cell, "Bu")
     kept, expand = reduction(cell, none(cell), fixed=fixed)
     assert not expand[:, fixed].any()

@@ -8,7 +8,6 @@ import torch
 from reference import normal, random_cell, random_model
 from torch import Tensor
 
-from lfrtorch.engine.nonlinearity import Network
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.bounded_system import BoundedSystem
@@ -16,6 +15,7 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import CholeskySystem, System
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.stable_states import PoleBounds, fading, largest_modulus, stabilised
+from lfrtorch.maps.network import Network
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 

@@ -307,8 +307,8 @@ def test_start_states_that_no_input_leads_to_are_improbable():
     search = both.search(matrices).advance(1)
     errors = search.problem.errors
     (x0,) = errors.parameters.initial_states(search.state.theta).numpy()
-    cell = errors.cell_at(search.state.theta)
-    A, B = (m.detach().numpy() for m in (cell.A, cell.Bu))
+    W = errors.parameters.weights(search.state.theta)
+    A, B = W.A.numpy(), W.Bu.numpy()
     # The state after the last sample counts, too.
     states = [reference.dlsim((A, B, C, 0 * B), np.vstack([r.u, [[0.0]]])) for r in records]
     P = sum(x.T @ x for x in states) / 452

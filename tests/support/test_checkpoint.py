@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from reference import random_cell, random_model
+from reference import measure, normal, random_cell, random_model
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 import lfrtorch
 from lfrtorch._support import checkpoint
-from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.model import Model, load
 from lfrtorch.records import Channel
 
@@ -206,6 +207,38 @@ def test_one_layer_of_before_is_read_and_several_are_refused(saved: Path):
     assert np.array_equal(load(saved).simulate(U), small().simulate(U))
     edit(saved, static={"type": "Beyond", "base": network | {"layers": 3}})
     refused(saved, "a network of 3 hidden layers, and this version has networks of one")
+
+
+@pytest.mark.numeric
+def test_a_map_less_a_linear_one_of_before_is_read_as_the_map(tmp_path: Path):
+    """w = W (f(Z z) - L Z z), f of the same kind once more, as canonical forms were written."""
+    model = small()
+    record = measure(model, 60)
+    model = model.reaching(record)
+    assert model.reach is not None
+    folder = model.save(tmp_path / "saved")
+    weights = load_file(folder / "weights.safetensors")
+    own = json.loads((folder / "model.json").read_text())["static"]
+    for seed in range(2):
+        L, Z, W = (0.5 * normal(*shape, seed=seed) for shape in ((1, 2), (2, 2), (1, 1)))
+        for into, of_x, of_u in (("Bw", "A", "Bu"), ("Dyw", "Cy", "Dyu")):
+            weights[of_x] = weights[of_x] + weights[into] @ L @ weights["Cz"]
+            weights[of_u] = weights[of_u] + weights[into] @ L @ weights["Dzu"]
+            weights[into] = weights[into] @ W.inverse()
+        for name in ("Cz", "Dzu", "reach.middle"):
+            weights[name] = Z.inverse() @ weights[name]
+        weights["reach.axes"] = weights["reach.axes"] @ Z
+        weights = {re.sub(r"^static\.", "static.base.", name): w for name, w in weights.items()}
+        weights |= {"static.slope": L, "static.into": Z, "static.out": W}
+        own = {"type": "Beyond", "base": own}
+    edit(folder, static=own)
+    save_file({name: w.contiguous() for name, w in weights.items()}, folder / "weights.safetensors")
+    again = load(folder)
+    np.testing.assert_allclose(again.simulate(record), record.y, rtol=0, atol=1e-9)
+    assert isinstance(again.lfr.cell.static, Network)
+    assert again.reach is not None
+    np.testing.assert_allclose(again.reach.z.middle, model.reach.z.middle, atol=1e-9)
+    np.testing.assert_allclose(again.reach.z.axes, model.reach.z.axes, atol=1e-9)
 
 
 @pytest.mark.parametrize("kept", [0, 4, 0.5, 0.99])

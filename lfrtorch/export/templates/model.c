@@ -7,9 +7,10 @@ enum {
     NX = {{ NAME }}_NX,
     NU = {{ NAME }}_NU,
     NY = {{ NAME }}_NY,
-{% for letters, size in inner %}
-    {{ letters }} = {{ size }},
-{% endfor %}
+{% if nw %}
+    NZ = {{ nz }},
+    NW = {{ nw }},
+{% endif %}
 {% if G %}
     NG = NY + NX, /* noise of outputs and states */
     NC = NG + NX, /* columns of M, and its most rows */
@@ -28,7 +29,7 @@ static void add(double *to, const double *M, const double *v, int rows, int colu
             to[i] += M[i * columns + j] * v[j];
 }
 
-{% if static or G %}
+{% if nw or G %}
 /* to += M N, with M of rows x inner and N of inner x columns. */
 static void add_product(double *to, const double *M, const double *N, int rows, int inner,
     int columns)
@@ -53,89 +54,8 @@ static void deviation(const double *u, double *v)
         v[i] = u[i] - u_offset[i];
 }
 
-{% if activation %}
-/* v = Wz z + bz and h = {{ activation }}(v). */
-static void neurons(const double *z, double *v, double *h)
-{
-    copy(v, bz, NN);
-    add(v, Wz, z, NN, NZ);
-    for (int i = 0; i < NN; i++)
-        h[i] = {{ value }};
-}
-
-/* w = f(z). */
-static void map(const double *z, double *w)
-{
-    double v[NN], h[NN];
-    neurons(z, v, h);
-    copy(w, bw, NW);
-    add(w, Ww, h, NW, NN);
-}
-
-/* J = dw/dz. */
-static void map_jacobian(const double *z, double *J)
-{
-    double v[NN], h[NN], dh[NN * NZ];
-    neurons(z, v, h);
-    for (int i = 0; i < NN; i++)
-        for (int j = 0; j < NZ; j++)
-            dh[i * NZ + j] = Wz[i * NZ + j] * ({{ slope }});
-    for (int i = 0; i < NW * NZ; i++)
-        J[i] = 0.0;
-    add_product(J, Ww, dh, NW, NN, NZ);
-}
-
-{% endif %}
-{% if monomials %}
-/* m = 1, z1, z2, .., z1 z1, z1 z2, ..: each is an earlier one times one z. */
-static void products(const double *z, double *m)
-{
-    m[0] = 1.0;
-    for (int i = 1; i < NM; i++)
-        m[i] = m[growth[i - 1][0]] * z[growth[i - 1][1]];
-}
-
-/* w = f(z). */
-static void map(const double *z, double *w)
-{
-    double m[NM];
-    products(z, m);
-    for (int i = 0; i < NW; i++)
-        w[i] = 0.0;
-    add(w, C, m, NW, NM);
-}
-
-/* J = dw/dz. */
-static void map_jacobian(const double *z, double *J)
-{
-    double m[NM];
-    products(z, m);
-    for (int i = 0; i < NW * NZ; i++)
-        J[i] = 0.0;
-    for (int s = 0; s < NS; s++)
-        for (int i = 0; i < NW; i++)
-            J[i * NZ + slopes[s][1]] += slopes[s][2] * C[i * NM + slopes[s][0]] * m[slopes[s][3]];
-}
-
-{% endif %}
-{% if operations %}
-/* w = f(z). */
-static void map(const double *z, double *w)
-{
-    (void)z;
-{% for to, value in operations.map %}
-    {{ to }} = {{ value }};
-{% endfor %}
-}
-
-/* J = dw/dz. */
-static void map_jacobian(const double *z, double *J)
-{
-    (void)z;
-{% for to, value in operations.jacobian %}
-    {{ to }} = {{ value }};
-{% endfor %}
-}
+{% if nw %}
+{% include "maps/" ~ written.template ~ ".c" %}
 
 {% endif %}
 void {{ name }}_reset(double x[NX])
@@ -160,7 +80,7 @@ void {{ name }}_step(const double x[NX], const double u[NU], double x_next[NX], 
     add(y, Dyu, v, NY, NU);
     add(next, A, x, NX, NX);
     add(next, Bu, v, NX, NU);
-{% if static %}
+{% if nw %}
     double z[NZ] = {0.0}, w[NW];
     add(z, Cz, x, NZ, NX);
     add(z, Dzu, v, NZ, NU);
@@ -178,7 +98,7 @@ void {{ name }}_jacobians(const double x[NX], const double u[NU], double dx_dx[N
     copy(dx_du, Bu, NX * NU);
     copy(dy_dx, Cy, NY * NX);
     copy(dy_du, Dyu, NY * NU);
-{% if static %}
+{% if nw %}
     double v[NU], z[NZ] = {0.0}, J[NW * NZ], dw_dx[NW * NX] = {0.0}, dw_du[NW * NU] = {0.0};
     deviation(u, v);
     add(z, Cz, x, NZ, NX);

@@ -25,32 +25,15 @@ x = x(:);
 v = u(:) - m.u_offset;
 x_next = m.A * x + m.Bu * v;
 y = m.Cy * x + m.Dyu * v + m.y_offset;
-{% if static %}
+{% if nw %}
 z = m.Cz * x + m.Dzu * v;
-{% if value %}
-[h, slope] = neurons(m.Wz * z + m.bz);
-w = m.Ww * h + m.bw;
-{% else %}
-p = ones({{ monomials }}, 1); % 1, z1, z2, .., z1 z1, z1 z2, ..
-for i = 1:{{ monomials - 1 }}
-    p(i + 1) = p(m.growth(i, 1)) * z(m.growth(i, 2));
-end
-w = m.C * p;
-{% endif %}
+w = static_map(m, z);
 x_next = x_next + m.Bw * w;
 y = y + m.Dyw * w;
 {% endif %}
 if nargout > 2
-{% if value %}
-    J = m.Ww * (repmat(slope, 1, {{ nz }}) .* m.Wz); % dw/dz
-{% elif static %}
-    J = zeros({{ nw }}, {{ nz }}); % dw/dz
-    for i = 1:size(m.slopes, 1)
-        s = m.slopes(i, :);
-        J(:, s(2)) = J(:, s(2)) + s(3) * p(s(4)) * m.C(:, s(1));
-    end
-{% endif %}
-{% if static %}
+{% if nw %}
+    [~, J] = static_map(m, z);
     A = m.A + m.Bw * J * m.Cz;
     B = m.Bu + m.Bw * J * m.Dzu;
     C = m.Cy + m.Dyw * J * m.Cz;
@@ -63,10 +46,7 @@ if nargout > 2
 {% endif %}
 end
 end
-{% if value %}
+{% if nw %}
 
-function [h, slope] = neurons(v)
-h = {{ value }};
-slope = {{ slope }};
-end
+{% include "maps/" ~ written.template ~ ".m" %}
 {% endif %}

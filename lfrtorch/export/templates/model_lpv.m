@@ -8,9 +8,9 @@ function [A, B, C, D, p] = {{ name }}_lpv(x, u)
 %
 %   They are A(:,:,1) + p(1) A(:,:,2) + p(2) A(:,:,3) + .., with the arrays and points of the struct
 %   lpv in {{ name }}.mat; a row of lpv.bounds has the least and the largest value of one p.
-{% if static and schedule == "neurons" %}
+{% if schedule == "neurons" %}
 %   p(i) is the mean slope of neuron i between its values at x0, u0 and at x, u.
-{% elif static %}
+{% elif nw %}
 %   p are the entries of Delta, by rows: w - w0 = Delta (z - z0).
 {% else %}
 %   There is no p: the model is linear.
@@ -26,24 +26,17 @@ if numel(x) ~= {{ nx }} || numel(u) ~= {{ nu }}
     error('{{ name }}:size', '{{ name }} takes x of {{ nx }} and u of {{ nu }} numbers; these have %d and %d.', ...
         numel(x), numel(u));
 end
-{% if static %}
+{% if nw %}
 d = f.Cz * (x(:) - f.x0) + f.Dzu * (u(:) - f.u0); % z - z0
 z = m.Cz * f.x0 + m.Dzu * (f.u0 - m.u_offset); % z0
-{% if value %}
+{% if schedule == "neurons" %}
 p = mean_slope(m.Wz * z + m.bz, m.Wz * d);
 {% else %}
 % The mean of the slope between z0 and z, by a Gauss-Legendre rule that is exact.
 Delta = zeros({{ nw }}, {{ nz }});
 for n = 1:numel(f.nodes)
-    z_n = z + f.nodes(n) * d;
-    q = ones({{ monomials }}, 1); % 1, z1, z2, .., z1 z1, z1 z2, ..
-    for i = 1:{{ monomials - 1 }}
-        q(i + 1) = q(m.growth(i, 1)) * z_n(m.growth(i, 2));
-    end
-    for i = 1:size(m.slopes, 1)
-        s = m.slopes(i, :);
-        Delta(:, s(2)) = Delta(:, s(2)) + f.weights(n) * s(3) * q(s(4)) * m.C(:, s(1));
-    end
+    [~, J] = static_map(m, z + f.nodes(n) * d);
+    Delta = Delta + f.weights(n) * J;
 end
 p = reshape(Delta.', [], 1);
 {% endif %}
@@ -56,12 +49,12 @@ end
 function M = at(Ms, p)
 M = reshape(reshape(Ms, [], numel(p) + 1) * [1; p], size(Ms, 1), size(Ms, 2));
 end
-{% if value %}
 
+{% if schedule == "neurons" %}
 function s = mean_slope(v, d)
 % (sigma(v + d) - sigma(v)) / d without cancellation.
 a = v + d;
-{% for line in mean_slope %}
+{% for line in map.sigma.matlab_mean_slope %}
 {{ line }}
 {% endfor %}
 end
@@ -71,6 +64,8 @@ function q = over(a, d)
 q = ones(size(d));
 q(d ~= 0) = a(d ~= 0) ./ d(d ~= 0);
 end
+{% else %}
+{% include "maps/" ~ written.template ~ ".m" %}
 {% endif %}
 {% else %}
 p = zeros(0, 1);

@@ -9,9 +9,9 @@ from reference import normal
 from torch.func import jacrev, vmap
 
 from lfrtorch._support.types import Array
-from lfrtorch.engine.activations import ACTIVATIONS
-from lfrtorch.engine.nonlinearity import Network
-from lfrtorch.engine.static_enclosure import Interval, enclosure, everywhere
+from lfrtorch.maps.activations import ACTIVATIONS
+from lfrtorch.maps.enclosure import Interval, everywhere
+from lfrtorch.maps.network import Network
 
 pytestmark = pytest.mark.numeric
 
@@ -49,26 +49,26 @@ def test_no_value_or_slope_leaves_what_was_found(nz, nw, activation, seed):
     low = normal(nz, seed=seed).numpy()
     box = Interval(low, low + np.abs(normal(nz, seed=seed + 1).numpy()))
     z, w, J = samples(static, box)
-    found, anywhere = enclosure(static, box), enclosure(static, everywhere(nz))
+    found, anywhere = static.enclosure(box), static.enclosure(everywhere(nz))
     for each in (found, anywhere):
         assert holds(each.w, w)
         assert holds(each.J, J)
     K = normal(nw, nz, seed=seed + 2).numpy()
-    assert holds(enclosure(static, box, K=K).w, w - z @ K.T)
+    assert holds(static.enclosure(box, K=K).w, w - z @ K.T)
 
 
 @pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
 def test_one_input_is_bounded_closely(activation: str):
     static, box = network(1, 2, activation), Interval(np.array([-1.0]), np.array([2.0]))
     _, w, J = samples(static, box)
-    found = enclosure(static, box)
+    found = static.enclosure(box)
     for interval, values in ((found.w, w), (found.J, J)):
         assert (2 * interval.radius <= 1.02 * np.ptp(values, axis=0) + 1e-9).all()
 
 
 def test_a_point_is_a_box():
     static, z = network(2, 1, "tanh"), np.array([0.3, -0.2])
-    found = enclosure(static, Interval(z, z))
+    found = static.enclosure(Interval(z, z))
     w = static(torch.as_tensor(z)).detach().numpy()
     assert found.w.middle == pytest.approx(w, rel=1e-9)
     assert found.w.radius == pytest.approx(0.0, abs=1e-9)
@@ -78,8 +78,8 @@ def test_what_else_is_known_of_the_neurons_leaves_cells_out():
     static = network(2, 1, "tanh")
     box = Interval(np.full(2, -1.0), np.full(2, 1.0))
     z, w, _ = samples(static, box)
-    found = enclosure(static, box, Interval(np.full(6, -0.5), np.full(6, 0.5)))
+    found = static.enclosure(box, Interval(np.full(6, -0.5), np.full(6, 0.5)))
     inside = (np.abs(z @ static.Wz.detach().numpy().T) <= 0.5).all(axis=1)
     assert inside.sum() > 10
     assert holds(found.w, w[inside])
-    assert float(found.w.radius[0]) < 0.5 * float(enclosure(static, box).w.radius[0])
+    assert float(found.w.radius[0]) < 0.5 * float(static.enclosure(box).w.radius[0])

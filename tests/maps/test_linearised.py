@@ -7,9 +7,11 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.testing import assert_close
 
-from lfrtorch.engine.activations import ACTIVATIONS
-from lfrtorch.engine.nonlinearity import Network, Polynomial, linearise_static
-from lfrtorch.engine.static_jacobian import StaticJacobian
+from lfrtorch.maps.activations import ACTIVATIONS
+from lfrtorch.maps.linearised import LinearisedMap, TorchMap, linearise_map
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.polynomial import Polynomial
+from lfrtorch.maps.static_map import as_map
 
 pytestmark = pytest.mark.numeric
 
@@ -59,27 +61,36 @@ def expected_slopes(static: nn.Module, weights: dict[str, Tensor], z: Tensor):
     return torch.stack(J), torch.stack(by_weight)
 
 
-def check(jacobian: StaticJacobian, static: nn.Module, weights: dict[str, Tensor], z: Tensor):
-    by_weight = jacobian.by_weight()
+def linearised(static: nn.Module | None, z: Tensor, weights: dict[str, Tensor], nw: int):
+    """The map in machine code, if it has any, and by torch."""
+    own = as_map(static, z.shape[-1], nw)
+    phi = torch.cat([z.new_zeros(0), *(w.flatten() for w in weights.values())])
+    return linearise_map(own, z, phi, own.code), TorchMap(own, z, phi)
+
+
+def check(static: nn.Module, weights: dict[str, Tensor], z: Tensor, nw: int = nw):
+    for found in linearised(static, z, weights, nw):
+        _check(found, static, weights, z)
+
+
+def _check(found: LinearisedMap, static: nn.Module, weights: dict[str, Tensor], z: Tensor):
+    by_weight = found.by_weight()
     for r in range(R):
         for k in range(T):
             J, by = expected_slopes(static, weights, z[r, k])
-            assert_close(jacobian.J[r, k], J, rtol=1e-12, atol=1e-14)
+            assert_close(found.J[r, k], J, rtol=1e-12, atol=1e-14)
             assert_close(by_weight[r, k], by.double(), rtol=1e-12, atol=1e-14)
     direction, d_w = normal(by_weight.shape[-1], seed=8), normal(*by_weight.shape[:3], seed=9)
-    assert_close(jacobian.tangent(direction), by_weight @ direction, rtol=1e-12, atol=1e-12)
+    assert_close(found.tangent(direction), by_weight @ direction, rtol=1e-12, atol=1e-12)
     expected = (by_weight * d_w.unsqueeze(-1)).sum(dim=(1, 2))
-    assert_close(jacobian.adjoint(d_w), expected, rtol=1e-12, atol=1e-12)
-    part = jacobian.part(slice(1, 2), slice(2, 4))
-    assert_close(part.by_weight(), by_weight[1:2, 2:4], rtol=1e-14, atol=1e-15)
-    assert_close(part.adjoint(d_w[1:2, 2:4]), (by_weight * d_w.unsqueeze(-1))[1:2, 2:4].sum((1, 2)))
+    assert_close(found.adjoint(d_w), expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
 def test_network(activation: str):
     static, z = network(activation), normal(R, T, nz)
     weights = weights_of(static)
-    check(linearise_static(static, z, weights), static, weights, z)
+    check(static, weights, z, nw)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 5])
@@ -88,25 +99,25 @@ def test_network(activation: str):
 def test_polynomial(nz: int, nw: int, degree: int):
     static, z = Polynomial(nz, nw, degree, dtype=torch.float64), normal(R, T, nz)
     weights = weights_of(static)
-    check(linearise_static(static, z, weights), static, weights, z)
+    check(static, weights, z, nw)
 
 
 def test_own_module():
     static, z = Bend(), normal(R, T, nz)
     weights = weights_of(static)
-    check(linearise_static(static, z, weights), static, weights, z)
+    check(static, weights, z, nw)
 
 
 def test_map_without_parameters():
     z = normal(R, T, nz)
-    jacobian = linearise_static(Cube(), z, {})
-    assert_close(jacobian.J, torch.diag_embed(3 * z**2), rtol=1e-14, atol=0)
-    assert jacobian.by_weight().shape == (R, T, nz, 0)
-    assert jacobian.adjoint(z).shape == (R, 0)
-    assert torch.equal(jacobian.tangent(z.new_zeros(0)), torch.zeros_like(z))
+    for found in linearised(Cube(), z, {}, nz):
+        assert_close(found.J, torch.diag_embed(3 * z**2), rtol=1e-14, atol=0)
+        assert found.by_weight().shape == (R, T, nz, 0)
+        assert found.adjoint(z).shape == (R, 0)
+        assert torch.equal(found.tangent(z.new_zeros(0)), torch.zeros_like(z))
 
 
 def test_no_map():
-    jacobian = linearise_static(None, normal(R, T, 0), {})
-    assert jacobian.J.shape == (R, T, 0, 0)
-    assert jacobian.by_weight().shape == (R, T, 0, 0)
+    for found in linearised(None, normal(R, T, 0), {}, 0):
+        assert found.J.shape == (R, T, 0, 0)
+        assert found.by_weight().shape == (R, T, 0, 0)

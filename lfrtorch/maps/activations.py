@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from lfrtorch._support.types import Array
-from lfrtorch.engine import simulation_kernel as compiled
+from lfrtorch.maps import activation_kernel as compiled
+from lfrtorch.maps.operations import Formula
 
 FAR = 1e100
 """Stands for infinity: its products are finite, and every bounded σ is at its limit."""
@@ -34,12 +35,10 @@ class Activation:
             shape.
         extremes, slope_extremes: where σ and σ' have an extreme.
         c: σ(v[i]) and σ'(v[i]) in C, from v and h; a v that is not a number stays one.
-        numpy: σ(v) in Python.
         matlab: σ(v) and σ'(v) in MATLAB, from v and h.
         matlab_mean_slope: lines that compute s = (σ(a) - σ(v)) / d with a = v + d; ``over(a, d)``
             is a / d, and 1 for d = 0.
-        casadi: the package, v -> σ(v).
-        onnx: an ``export.onnx_graph.Graph``, the name of v -> that of σ(v).
+        of_number: σ(v) of one number by ``OPERATIONS``. Default: ``value``.
         meaning: σ as an equation, if its name does not say it.
     """
 
@@ -48,14 +47,17 @@ class Activation:
     slope: Callable[[Tensor, Tensor], Tensor]
     mean_slope: Callable[[Array, Array], Array]
     c: tuple[str, str]
-    numpy: str
     matlab: tuple[str, str]
     matlab_mean_slope: tuple[str, ...]
-    casadi: Callable[[Any, Any], Any]
-    onnx: Callable[[Any, str], str]
     extremes: tuple[float, ...] = ()
     slope_extremes: tuple[float, ...] = ()
+    of_number: Callable[[Any], Any] | None = None
     meaning: str = ""
+
+    @property
+    def formula(self) -> Formula:
+        """σ as a table of operations."""
+        return Formula.traced(lambda v: [(self.of_number or self.value)(v)], 1)
 
     def values(self, v: Array) -> Array:
         """σ(v)."""
@@ -109,13 +111,6 @@ def _mean_softplus(v: Array, d: Array) -> Array:
     return np.where(d == 0, s, _quotient(part, d))
 
 
-def _onnx_softplus(graph: Any, v: str) -> str:
-    # The operator of that name has no float64 in every runtime.
-    one, node = graph.constant("one", np.ones(1)), graph.node
-    rest = node("Log", node("Add", one, node("Exp", node("Neg", node("Abs", v)))))
-    return node("Add", node("Relu", v), rest)
-
-
 ACTIVATIONS = {
     "tanh": Activation(
         code=compiled.TANH,
@@ -124,11 +119,8 @@ ACTIVATIONS = {
         slope_extremes=(0.0,),
         mean_slope=_mean_tanh,
         c=("tanh(v[i])", "1.0 - h[i] * h[i]"),
-        numpy="np.tanh(v)",
         matlab=("tanh(v)", "1 - h .^ 2"),
         matlab_mean_slope=("s = (1 - tanh(a) .* tanh(v)) .* over(tanh(d), d);",),
-        casadi=lambda ca, v: ca.tanh(v),
-        onnx=lambda graph, v: graph.node("Tanh", v),
     ),
     "sigmoid": Activation(
         code=compiled.SIGMOID,
@@ -137,13 +129,10 @@ ACTIVATIONS = {
         slope_extremes=(0.0,),
         mean_slope=lambda v, d: _mean_tanh(v / 2, d / 2) / 4,  # (1 + tanh(v / 2)) / 2
         c=("1.0 / (1.0 + exp(-v[i]))", "h[i] * (1.0 - h[i])"),
-        numpy="0.5 + 0.5 * np.tanh(0.5 * v)",
         matlab=("1 ./ (1 + exp(-v))", "h .* (1 - h)"),
         matlab_mean_slope=(
             "s = (1 - tanh(a / 2) .* tanh(v / 2)) .* over(tanh(d / 2), d / 2) / 4;",
         ),
-        casadi=lambda ca, v: 0.5 + 0.5 * ca.tanh(0.5 * v),  # derivatives do not overflow either
-        onnx=lambda graph, v: graph.node("Sigmoid", v),
     ),
     "relu": Activation(
         code=compiled.RELU,
@@ -151,15 +140,12 @@ ACTIVATIONS = {
         slope=lambda v, h: (v > 0).to(v.dtype),
         mean_slope=_mean_relu,
         c=("v[i] < 0.0 ? 0.0 : v[i]", "v[i] > 0.0 ? 1.0 : 0.0"),
-        numpy="np.maximum(v, 0.0)",
         matlab=("max(v, 0)", "double(v > 0)"),
         matlab_mean_slope=(
             "s = over(max(a, 0) - max(v, 0), d);",
             "s(a > 0 & v > 0) = 1;",
             "s(a <= 0 & v <= 0) = 0;",
         ),
-        casadi=lambda ca, v: ca.fmax(v, 0.0),
-        onnx=lambda graph, v: graph.node("Relu", v),
     ),
     "rbf": Activation(
         code=compiled.RBF,
@@ -169,14 +155,11 @@ ACTIVATIONS = {
         slope_extremes=(-math.sqrt(0.5), math.sqrt(0.5)),
         mean_slope=_mean_rbf,
         c=("exp(-v[i] * v[i])", "-2.0 * v[i] * h[i]"),
-        numpy="np.exp(-(v**2))",
         matlab=("exp(-v .^ 2)", "-2 * v .* h"),
         matlab_mean_slope=(
             "q = abs(d .* (v + a));",
             "s = -(v + a) .* exp(-min(a .^ 2, v .^ 2)) .* over(-expm1(-q), q);",
         ),
-        casadi=lambda ca, v: ca.exp(-v * v),
-        onnx=lambda graph, v: graph.node("Exp", graph.node("Neg", graph.node("Mul", v, v))),
         meaning="rbf(v) = exp(-v^2)",
     ),
     "softplus": Activation(
@@ -185,7 +168,6 @@ ACTIVATIONS = {
         slope=lambda v, h: torch.sigmoid(v),
         mean_slope=_mean_softplus,
         c=("(v[i] < 0.0 ? 0.0 : v[i]) + log1p(exp(-fabs(v[i])))", "1.0 / (1.0 + exp(-v[i]))"),
-        numpy="np.logaddexp(v, 0.0)",
         matlab=("max(v, 0) + log1p(exp(-abs(v)))", "1 ./ (1 + exp(-v))"),
         matlab_mean_slope=(
             "s = 1 ./ (1 + exp(-v));",
@@ -195,8 +177,7 @@ ACTIVATIONS = {
             "value = @(v) max(v, 0) + log1p(exp(-abs(v)));",
             "s(far) = (value(a(far)) - value(v(far))) ./ d(far);",
         ),
-        casadi=lambda ca, v: ca.fmax(v, 0.0) + ca.log1p(ca.exp(-ca.fabs(v))),
-        onnx=_onnx_softplus,
+        of_number=torch.nn.functional.softplus,
         meaning="softplus(v) = log(1 + exp(v))",
     ),
 }

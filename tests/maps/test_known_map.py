@@ -7,12 +7,13 @@ from torch.testing import assert_close
 
 from lfrtorch.engine import simulation
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.direct_sum import DirectSum
-from lfrtorch.engine.known_map import KnownEquations, KnownMap
-from lfrtorch.engine.nonlinearity import Network, Polynomial, linearise_static, of_static
-from lfrtorch.engine.operations import Formula
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
-from lfrtorch.engine.static_jacobian import ModuleJacobian
+from lfrtorch.maps.direct_sum import DirectSum
+from lfrtorch.maps.known_map import KnownEquations, KnownModel
+from lfrtorch.maps.linearised import CompiledMap, TorchMap, linearise_map
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.operations import Formula
+from lfrtorch.maps.polynomial import Polynomial
 
 pytestmark = pytest.mark.numeric
 
@@ -31,14 +32,14 @@ def next_state(*v):
     return [x + 0.1 * change for x, change in zip(v, rates(*v), strict=False)]
 
 
-def known_map(method: str) -> KnownMap:
+def known_map(method: str) -> KnownModel:
     f = Formula.traced(next_state if method == "discrete" else rates, 6)
     h = Formula.traced(lambda h1, h2, u, a, b, k: [h2 + 0.1 * a * u], 6)
     substeps = 1 if method == "discrete" else 3
     names = ("h1", "h2"), ("a", "b", "k"), ("", "", "1/s")
     how, centred = method.split(maxsplit=1)[0], method.endswith("centred")
     equations = KnownEquations(f, h, *names, 1, how, substeps, centred)
-    found = KnownMap(equations, 0.2, dtype=torch.float64)
+    found = KnownModel(equations, 0.2, dtype=torch.float64)
     with torch.no_grad():
         found.p_scale.copy_(torch.tensor([0.3, 0.2, 0.4]))
         found.of_z.copy_(torch.tensor([[0.1, 2.0], [0.2, 1.5], [1.0, 0.7]]))
@@ -78,7 +79,7 @@ def signals(cell: LFRCell):
 def test_machine_code_simulates_the_equations(method: str):
     for cell in cells(method):
         u, x0 = signals(cell)
-        assert simulation.is_compiled(cell, u)
+        assert cell.weights().layout.compiled
         found = simulation.simulate(cell, u, x0)
         for r in range(len(u)):
             expected = reference.nl_lfr(cell, reference.weights(cell), u[r], x0[r])
@@ -91,16 +92,15 @@ def test_derivatives_are_those_of_torch_func(method: str):
     for cell in cells(method):
         u, x0 = signals(cell)
         trajectory = simulation.simulate(cell, u, x0)
-        weights = {n: w.detach() for n, w in of_static(dict(cell.named_parameters())).items()}
-        found = linearise_static(cell.static, trajectory.z, weights)
-        expected = ModuleJacobian(cell.static, trajectory.z, weights)
+        W = cell.weights()
+        found = linearise_map(W.map, trajectory.z, W.phi, W.map.code)
+        assert isinstance(found, CompiledMap)
+        expected = TorchMap(W.map, trajectory.z, W.phi)
         assert_close(found.J, expected.J)
         assert_close(found.by_weight(), expected.by_weight())
-        d_w, d_weights = torch.rand_like(trajectory.w), torch.rand(expected.by_weight().shape[-1])
-        assert_close(found.tangent(d_weights.double()), expected.tangent(d_weights.double()))
+        d_w, d_phi = torch.rand_like(trajectory.w), torch.rand_like(W.phi)
+        assert_close(found.tangent(d_phi), expected.tangent(d_phi))
         assert_close(found.adjoint(d_w), expected.adjoint(d_w))
-        part = found.part(slice(1, 2), slice(3, 7))
-        assert_close(part.by_weight(), expected.by_weight()[1:2, 3:7])
 
 
 def test_jacobian_of_the_outputs_is_that_of_the_recurrence():
@@ -119,7 +119,7 @@ def test_jacobian_of_the_outputs_is_that_of_the_recurrence():
 
 
 def test_equations_survive_a_description():
-    equations = known_map("rk4").equations
+    equations = known_map("rk4").physics
     assert KnownEquations.of(equations.described()) == equations
     with pytest.raises(ValueError, match="do not fit"):
         KnownEquations.of(equations.described() | {"method": "bdf"})
@@ -140,7 +140,7 @@ def test_a_centred_hold_is_that_of_the_middle_of_samples():
     for centred in (False, True):
         equations = KnownEquations(f, h, ("x",), (), (), 1, "rk4", 1, centred)
         cell = LFRCell(
-            1, 1, 1, 2, 2, KnownMap(equations, 0.2, dtype=torch.float64), random=False
+            1, 1, 1, 2, 2, KnownModel(equations, 0.2, dtype=torch.float64), random=False
         ).double()
         with torch.no_grad():
             cell.Cz[0], cell.Dzu[1], cell.Bw[0, 0], cell.Dyw[0, 1] = 1.0, 1.0, 1.0, 1.0
@@ -153,7 +153,7 @@ def test_a_centred_hold_is_that_of_the_middle_of_samples():
 @pytest.mark.parametrize("method", METHODS)
 def test_float32_runs_in_the_same_machine_code(method: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(simulation, "newton_states", None)  # what torch would do
-    monkeypatch.setattr(ModuleJacobian, "__init__", None)
+    monkeypatch.setattr(TorchMap, "__init__", None)
     for cell in cells(method):
         u, x0 = signals(cell)
         exact = simulation.simulate(cell, u, x0)

@@ -5,7 +5,6 @@ In an LFR with fixed matrices this is the known model itself; beside it, the LFR
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -13,14 +12,15 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import Module, Parameter
+from torch.nn import Parameter
 
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.threads import has_kernels, spread, to_float64, workers
-from lfrtorch.engine.formula_code import machine_code
-from lfrtorch.engine.known_kernel import DISCRETE, EULER, RK4, known_slopes
-from lfrtorch.engine.operations import Formula, Symbol
-from lfrtorch.engine.static_jacobian import ModuleJacobian, StaticJacobian, Weights
+from lfrtorch._support.threads import to_float64
+from lfrtorch.maps.formula_code import machine_code
+from lfrtorch.maps.known_code import DISCRETE, EULER, RK4, known_slope, known_value
+from lfrtorch.maps.machine_code import SLOPE, Code, address
+from lfrtorch.maps.operations import Formula
+from lfrtorch.maps.static_map import StaticMap
 
 METHODS = {"discrete": DISCRETE, "euler": EULER, "rk4": RK4}
 """How a sample is made of f: its result is the next state, or its rates are integrated."""
@@ -70,7 +70,7 @@ class KnownEquations(NamedTuple):
         return cls(f, h, states, names, units, inputs, *how)
 
 
-class KnownMap(Module):
+class KnownModel(StaticMap):
     """The map of known equations, of normalised signals and parameters.
 
     Args:
@@ -96,11 +96,10 @@ class KnownMap(Module):
         device: torch.device | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
-        super().__init__()
-        self.equations, self.sample_time = equations, sample_time
         nx, count = len(equations.states), len(equations.parameters)
         nz, nw = nx + equations.inputs, nx + len(equations.h.results)
-        self.nx, self.nz, self.nw = nx, nz, nw
+        super().__init__(nz, nw)
+        self.nx, self.physics, self.sample_time = nx, equations, sample_time
         like: dict[str, Any] = {"device": device, "dtype": dtype}
         self.p = Parameter(torch.ones(count, **like))
         for name, size in (("of_z", nz), ("of_w", nw)):
@@ -111,25 +110,40 @@ class KnownMap(Module):
 
     def weight_shapes(self, nz: int, nw: int) -> dict[str, tuple[int, ...]]:
         """Shapes of the weights and buffers; nz and nw follow from the equations."""
-        count = len(self.equations.parameters)
+        count = len(self.physics.parameters)
         scaling = {"of_z": (self.nz, 2), "of_w": (self.nw, 2), "bounds": (count, 2)}
         return {"p": (count,), "p_scale": (count,), **scaling}
+
+    @property
+    def known(self) -> KnownModel:
+        """This."""
+        return self
+
+    @property
+    def learned(self) -> StaticMap:
+        """Nothing."""
+        return StaticMap()
+
+    def describe(self) -> dict[str, Any]:
+        """The equations."""
+        equations = self.physics.described()
+        return {"type": "Known", "equations": equations, "sample_time": self.sample_time}
 
     @property
     def physical(self) -> dict[str, float]:
         """The parameters in their units, by name."""
         values = (self.p * self.p_scale).detach().double().cpu().tolist()
-        return dict(zip(self.equations.parameters, values, strict=True))
+        return dict(zip(self.physics.parameters, values, strict=True))
 
     @property
     def outputs_have_parameters(self) -> bool:
         """Whether y depends on parameters of its own, and not through the states alone."""
-        return max(self.equations.h.used, default=0) >= self.nz
+        return max(self.physics.h.used, default=0) >= self.nz
 
     @property
     def steps(self) -> tuple[float, int, int]:
         """Seconds of one step of the integration, their number, and those before the output."""
-        e = self.equations
+        e = self.physics
         number = e.substeps * (1 + e.centred)
         return self.sample_time / number, number, e.substeps * e.centred
 
@@ -140,12 +154,13 @@ class KnownMap(Module):
         w = self._stepped(v, p, lambda formula, values: formula(*values))
         return (torch.stack(w, -1) - self.of_w[:, 0]) / self.of_w[:, 1]
 
-    def of_symbols(self, z: Sequence[Symbol]) -> list[Any]:
-        """w of z for a table of operations, with the parameters as numbers."""
+    def equations(self, z: Sequence[Any], phi: Sequence[Any]) -> Sequence[Any]:
+        """w of z and φ, single numbers each."""
         ends = (self.of_z, self.of_w)
         of_z, of_w = (each.detach().double().cpu().tolist() for each in ends)
         v = [offset + scale * each for each, (offset, scale) in zip(z, of_z, strict=True)]
-        p = [z[0].constant(value) for value in self.physical.values()]
+        p_scale = self.p_scale.detach().double().cpu().tolist()
+        p = [scale * each for each, scale in zip(phi, p_scale, strict=True)]
         w = self._stepped(v, p, lambda formula, values: formula.of_symbols(values))
         return [(each - offset) / scale for each, (offset, scale) in zip(w, of_w, strict=True)]
 
@@ -154,8 +169,8 @@ class KnownMap(Module):
     ) -> list[Any]:
         """[x+; y] of v = [x; u] and p in physical units; ``of`` evaluates a formula."""
         x, u = [*v[: self.nx]], [*v[self.nx :]]
-        f, h, (step, number, before) = self.equations.f, self.equations.h, self.steps
-        if self.equations.method == "discrete":
+        f, h, (step, number, before) = self.physics.f, self.physics.h, self.steps
+        if self.physics.method == "discrete":
             return [*of(f, [*x, *u, *p]), *of(h, [*x, *u, *p])]
 
         def rates(*terms: tuple[float, list[Any]]) -> list[Any]:
@@ -171,7 +186,7 @@ class KnownMap(Module):
         for n in range(number):
             y = of(h, [*x, *u, *p]) if n == before else y
             k1 = rates()
-            if self.equations.method == "euler":
+            if self.physics.method == "euler":
                 x = moved((step, k1))
                 continue
             k2 = rates((0.5 * step, k1))
@@ -180,58 +195,35 @@ class KnownMap(Module):
             x = moved((step / 6.0, k1), (step / 3.0, k2), (step / 3.0, k3), (step / 6.0, k4))
         return [*x, *y]
 
-    def kernel(self, *, slopes: bool = False) -> list[Any]:
-        """The map as ``known_kernel`` takes it, between p and w; ``slopes``: with derivatives."""
-        e = self.equations
-        f, h = (machine_code(each, slopes=slopes) for each in (e.f, e.h))
-        return [f, h, self.nx, METHODS[e.method], *self.steps]
+    @property
+    def weight_bounds(self) -> Float[Tensor, "P 2"]:
+        """Least and largest value of each parameter, normalised."""
+        return self.bounds / self.p_scale.unsqueeze(-1)
 
-    def arguments(self, p: Tensor | None = None) -> list[Any]:
-        """Scaling and physical parameters as ``known_kernel`` takes them."""
-        own = self.p if p is None else p
-        return [to_float64(each) for each in (self.of_z, self.of_w, own * self.p_scale)]
+    @property
+    def code(self) -> Code:
+        """The map in machine code, exact derivatives through the integration."""
+        e, (step, number, before) = self.physics, self.steps
+        made = [
+            machine_code(each, slopes=slopes) for slopes in (False, True) for each in (e.f, e.h)
+        ]
+        nx, nz, nw, count = self.nx, self.nz, self.nw, len(e.parameters)
+        addresses = [each.address for each in made]
+        sizes = nx, nz, nw, count, METHODS[e.method], number, before
+        scaling = (self.of_z.flatten(), self.of_w.flatten(), self.p_scale)
+        constants = np.concatenate([[step], *(to_float64(each) for each in scaling)])
+        q = nz + count
+        room = q + 2 * nx + nw * (1 + q) + (nw - nx) * q + 4 * nx * q
+        ints = np.array([*addresses, *sizes])
+        code = address(known_value), address(known_slope, SLOPE)
+        return Code(0, *code, ints, constants, max(room, q + 3 * nx + nw), made)
 
-    def linearised(self, z: Float[Tensor, "R T nz"], weights: Weights) -> StaticJacobian:
-        """The map linearised at z, with the given weights."""
-        if not has_kernels(z):
-            return ModuleJacobian(self, z, weights)
-        return KnownJacobian(self, z, weights["p"])
+    @property
+    def meaning(self) -> str:
+        """f(z) in words."""
+        return "a step of the known model"
 
     def extra_repr(self) -> str:
         """States and parameters, for ``print(module)``."""
         values = ", ".join(f"{name}={value:.6g}" for name, value in self.physical.items())
-        return f"{', '.join(self.equations.states)}; {values}"
-
-
-class KnownJacobian:
-    """A known model in machine code: derivatives of one step, exact through the integration."""
-
-    # The code is that of float64, for float32 as well.
-
-    def __init__(self, of: KnownMap, z: Float[Tensor, "R T nz"], p: Float[Tensor, " p"]) -> None:
-        R, T = z.shape[:2]
-        J, by_p = np.empty((R, T, of.nw, of.nz)), np.empty((R, T, of.nw, len(p)))
-        scaling = [*of.arguments(p), to_float64(of.p_scale)]
-        parts = min(R, workers())
-        formulas = of.kernel(slopes=True)
-        states = np.ascontiguousarray(to_float64(z))
-        spread(known_slopes, parts, parts, states, *scaling, *formulas, J, by_p)
-        self.J, self._by_p = (torch.from_numpy(each).to(z.dtype) for each in (J, by_p))
-
-    def part(self, records: slice, time: slice) -> StaticJacobian:
-        """The same for some of the records and samples."""
-        part = copy.copy(self)
-        part.J, part._by_p = self.J[records, time], self._by_p[records, time]
-        return part
-
-    def by_weight(self) -> Float[Tensor, "R T nw weights"]:
-        """∂w/∂φ."""
-        return self._by_p
-
-    def tangent(self, d_weights: Float[Tensor, " weights"]) -> Float[Tensor, "R T nw"]:
-        """(∂w/∂φ) dφ."""
-        return (self._by_p @ d_weights[..., None, :, None]).squeeze(-1)
-
-    def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R weights"]:
-        """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
-        return torch.einsum("rtqp,rtq->rp", self._by_p, d_w)
+        return f"{', '.join(self.physics.states)}; {values}"

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from lfrtorch.engine.operations import Formula, Operation, Symbol
+from lfrtorch.maps.operations import Formula, Operation, Symbol
 
 PYTHON = {
     "add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}",

@@ -1,4 +1,4 @@
-"""Values and slopes that a network cannot leave while its inputs stay in a box.
+"""Values and slopes that neurons cannot leave while their inputs stay in a box.
 
 Intervals go through the map: σ of an interval lies between its values at the ends and at the
 extremes inside, and so does σ'. This counts each neuron as if the others did not matter, and is too
@@ -19,11 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from torch import Tensor
 
 from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
-from lfrtorch.engine.activations import FAR
-from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.maps.activations import FAR, Activation
 
 _CELLS = 2**12
 """Most cells of a box."""
@@ -69,15 +69,19 @@ class Interval(NamedTuple):
 
 
 class Enclosure(NamedTuple):
-    """What a map cannot leave in a box: w (nw,), or w - K z, J = ∂w/∂z (nw, nz), and σ' (nn,).
+    """What a map cannot leave in a box.
 
-    ``centres`` (C, nz) are the middles of its cells.
+    Args:
+        w: its values (nw,), or w - K z.
+        J: ∂w/∂z (nw, nz).
+        centres: middles of cells of the box, (C, nz).
+        neurons: s (nn,), left (nw, nn) and right (nn, nz) of J = left diag(s) right, if it is one.
     """
 
     w: Interval
     J: Interval
-    slopes: Interval
     centres: Array
+    neurons: tuple[Interval, Tensor, Tensor] | None = None
 
 
 def everywhere(size: int) -> Interval:
@@ -85,46 +89,53 @@ def everywhere(size: int) -> Interval:
     return Interval(np.full(size, -FAR), np.full(size, FAR))
 
 
-def enclosure(
-    static: Network,
-    z: Interval,
-    a: Interval | None = None,
-    K: Float[Array, "nw nz"] | None = None,
-) -> Enclosure:
-    """Bounds of a network's outputs and slopes in a box z (nz,); ``everywhere`` for any z.
+class Layer(NamedTuple):
+    """The map w = Ww σ(Wz z + bz) + bw."""
 
-    ``a`` is what Wz z (nn,) cannot leave besides. With ``K``, w - K z is bounded instead of w.
-    """
-    sigma = static.sigma
-    Wz, bz, Ww, bw = (to_float64(p) for p in (static.Wz, static.bz, static.Ww, static.bw))
-    K = np.zeros((len(Ww), Wz.shape[1])) if K is None else K
-    cells = _cells(z, Wz, bz)
-    inside = _product(Wz, cells)
-    if a is not None:
-        inside = inside.within(a)
-        reached = (inside.low <= inside.high).all(axis=-1)
-        cells, inside = (Interval(i.low[reached], i.high[reached]) for i in (cells, inside))
-    centres = cells.middle
-    v = Interval(inside.low + bz, inside.high + bz)
-    slopes = _range(sigma.slopes, sigma.slope_extremes, v)
-    J = _jacobians(Wz, Ww, slopes)
-    w = _product(Ww, _range(sigma.values, sigma.extremes, v))
-    linear = _product(K, cells)
-    w = Interval(w.low + bw - linear.high, w.high + bw - linear.low)
-    # The mean value theorem about the centre of each cell.
-    steepest = np.maximum(np.abs(J.low - K), np.abs(J.high - K))
-    reach = (steepest @ cells.radius[..., None])[..., 0]
-    at = sigma.values(centres @ Wz.T + bz) @ Ww.T + bw - centres @ K.T
-    w = w.within(Interval(at - reach, at + reach))
-    return Enclosure(_hull(w).wider(), _hull(J).wider(), _hull(slopes).wider(), centres)
+    sigma: Activation
+    Wz: Tensor
+    bz: Tensor
+    Ww: Tensor
+    bw: Tensor
 
+    def enclosure(
+        self, z: Interval, a: Interval | None = None, K: Float[Array, "nw nz"] | None = None
+    ) -> Enclosure:
+        """Bounds in a box z (nz,), see ``StaticMap.enclosure``."""
+        sigma = self.sigma
+        Wz, bz, Ww, bw = map(to_float64, self[1:])
+        K = np.zeros((len(Ww), Wz.shape[1])) if K is None else K
+        cells = _cells(z, Wz, bz)
+        inside = _product(Wz, cells)
+        if a is not None:
+            inside = inside.within(a)
+            reached = (inside.low <= inside.high).all(axis=-1)
+            cells, inside = (Interval(i.low[reached], i.high[reached]) for i in (cells, inside))
+        centres = cells.middle
+        v = Interval(inside.low + bz, inside.high + bz)
+        slopes = _range(sigma.slopes, sigma.slope_extremes, v)
+        J = _jacobians(Wz, Ww, slopes)
+        w = _product(Ww, _range(sigma.values, sigma.extremes, v))
+        linear = _product(K, cells)
+        w = Interval(w.low + bw - linear.high, w.high + bw - linear.low)
+        # The mean value theorem about the centre of each cell.
+        steepest = np.maximum(np.abs(J.low - K), np.abs(J.high - K))
+        reach = (steepest @ cells.radius[..., None])[..., 0]
+        at = sigma.values(centres @ Wz.T + bz) @ Ww.T + bw - centres @ K.T
+        w = w.within(Interval(at - reach, at + reach))
+        neurons = _hull(slopes).wider(), self.Ww, self.Wz
+        return Enclosure(_hull(w).wider(), _hull(J).wider(), centres, neurons)
 
-def slopes_in(static: Network, cells: Interval) -> Interval:
-    """What ∂w/∂z (C, nw, nz) cannot leave in each cell (C, nz)."""
-    Wz, bz, Ww = (to_float64(p) for p in (static.Wz, static.bz, static.Ww))
-    inside = _product(Wz, cells)
-    v = Interval(inside.low + bz, inside.high + bz)
-    return _jacobians(Wz, Ww, _range(static.sigma.slopes, static.sigma.slope_extremes, v)).wider()
+    def slopes_in(
+        self, v: Interval, into: Float[Array, "nz nz"], middle: Float[Array, " nz"]
+    ) -> Interval:
+        """∂w/∂v in cells of v (C, nz), see ``StaticMap.slopes_in``."""
+        Wz, bz, Ww, _ = map(to_float64, self[1:])
+        bz, Wz = bz + Wz @ middle, Wz @ into
+        inside = _product(Wz, v)
+        inside = Interval(inside.low + bz, inside.high + bz)
+        slopes = _range(self.sigma.slopes, self.sigma.slope_extremes, inside)
+        return _jacobians(Wz, Ww, slopes).wider()
 
 
 def _jacobians(Wz: Float[Array, "nn nz"], Ww: Float[Array, "nw nn"], slopes: Interval) -> Interval:

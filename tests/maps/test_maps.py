@@ -10,10 +10,11 @@ from reference import SIGMA, normal
 from torch.func import functional_call, jacrev, vmap
 from torch.testing import assert_close
 
-from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.engine.simulation import simulate
+from lfrtorch.maps.activations import ACTIVATIONS
+from lfrtorch.maps.network import Network
+from lfrtorch.maps.polynomial import Polynomial
 
 pytestmark = pytest.mark.numeric
 

@@ -11,8 +11,8 @@ from torch.func import jacrev
 from torch.testing import assert_close
 
 from lfrtorch._support.errors import InputError
-from lfrtorch.engine.formula_code import machine_code
-from lfrtorch.engine.operations import OPERATIONS, Formula, UntraceableError
+from lfrtorch.maps.formula_code import machine_code
+from lfrtorch.maps.operations import OPERATIONS, Formula, UntraceableError
 
 pytestmark = pytest.mark.numeric
 

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from reference import SIGMA
 
 from lfrtorch._support.types import Array
-from lfrtorch.engine.activations import ACTIVATIONS
+from lfrtorch.maps.activations import ACTIVATIONS
 
 pytestmark = pytest.mark.numeric
 

@@ -1,0 +1,154 @@
+"""All numbers of a model as one vector, and where each matrix and weight stands in it.
+
+What simulates and differentiates is a function of these numbers. Compiled loops take the vector as
+it is; torch takes matrices, which are views of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lfrtorch._support.threads import has_kernels, to_float64
+from lfrtorch._support.types import Array, Integers
+from lfrtorch.maps.static_map import StaticMap
+
+MATRICES = {
+    "A": ("x", "x"), "Bu": ("x", "u"), "Bw": ("x", "w"), "Cz": ("z", "x"), "Dzu": ("z", "u"),
+    "Cy": ("y", "x"), "Dyu": ("y", "u"), "Dyw": ("y", "w"),
+}  # fmt: skip
+"""The matrices in their order: which signal each adds to, and which it multiplies."""
+
+
+class DirectTerms(NamedTuple):
+    """Direct terms of some columns of derivatives.
+
+    A triple (column, row, regressor) in ``x``, ``z`` or ``y``: the column's parameter multiplies
+    ``v[regressor]``, v = [x; u; w], in that row of the equation. Columns of the static map come
+    after these; ``static`` has their positions among all weights of the map.
+    """
+
+    x: Int[Integers, "n_x 3"]
+    z: Int[Integers, "n_z 3"]
+    y: Int[Integers, "n_y 3"]
+    static: Int[Integers, " n_static"]
+
+
+class Layout:
+    """The order of a model's numbers: eight matrices, then the weights φ of the static map.
+
+    Args:
+        nx, nu, ny, nz, nw: sizes.
+        static: the map.
+        parameters: names, sizes and which are free, in the order of the vector.
+        state_covariance: E x xᵀ over the training data, (nx, nx); before a fit 1.
+    """
+
+    def __init__(
+        self,
+        sizes: tuple[int, int, int, int, int],
+        static: StaticMap,
+        parameters: Sequence[tuple[str, int, bool]],
+        state_covariance: Tensor,
+    ) -> None:
+        self.state_covariance = state_covariance
+        self.sizes, self.static, self.code = sizes, static, static.code
+        self.compiled = self.code is not None and has_kernels(state_covariance)
+        """Whether machine code simulates the model on its device."""
+        nx, nu, ny, nz, nw = sizes
+        size = {"x": nx, "u": nu, "y": ny, "z": nz, "w": nw}
+        first_in_v = {"x": 0, "u": nx, "w": nx + nu}
+        self.places: dict[str, tuple[slice, tuple[int, int]]] = {}
+        self.spans: dict[str, slice] = {}
+        """Where each parameter stands."""
+        tables, at = [], 0
+        for name, (left, right) in MATRICES.items():
+            shape = size[left], size[right]
+            self.places[name] = slice(at, at + shape[0] * shape[1]), shape
+            rows, columns = np.indices(shape).reshape(2, -1)
+            equation = np.full_like(rows, "xzy".index(left))
+            tables.append(np.stack([equation, rows, first_in_v[right] + columns]))
+            at += shape[0] * shape[1]
+        self.phi, at = slice(at, None), 0
+        for name, count, _ in parameters:
+            self.spans[name], at = slice(at, at + count), at + count
+        positions = np.arange(at - self.phi.start)
+        self.table: Integers = np.concatenate(
+            [*tables, np.stack([np.full_like(positions, 3), positions, positions])], axis=1
+        )
+        """Of each number its equation (x, z, y: 0, 1, 2), its row and the signal in v = [x; u; w]
+        that it multiplies. Weights of the map have equation 3 and their position in φ."""
+        free = np.concatenate([np.full(count, is_free) for _, count, is_free in parameters])
+        self.free: Integers = np.flatnonzero(free)
+        """Positions of the free numbers, which are θ."""
+        self._terms: dict[bytes, DirectTerms] = {}
+
+    def direct_terms(self, positions: Integers) -> DirectTerms:
+        """The direct terms of columns for numbers at these positions, ascending."""
+        key = positions.tobytes()
+        if key not in self._terms:
+            equation, row, _ = table = self.table[:, positions]
+            entries = np.stack([np.arange(len(row)), *table[1:]], axis=1)
+            x, z, y = (entries[equation == e] for e in range(3))
+            self._terms[key] = DirectTerms(x, z, y, row[equation == 3])
+        return self._terms[key]
+
+    def place(self, name: str) -> slice:
+        """Where a parameter stands; weights of the map go by their own names."""
+        return self.spans[name] if name in MATRICES else self.spans[f"static.{name}"]
+
+
+class Weights:
+    """The numbers of a model: what simulates, and what derivatives are taken at.
+
+    ``A``, ``Bu``, ... and ``phi`` are views of ``flat``.
+    """
+
+    def __init__(self, layout: Layout, flat: Float[Tensor, " P"]) -> None:
+        self.layout, self.flat = layout, flat
+        self.nx, self.nu, self.ny, self.nz, self.nw = layout.sizes
+        self.map = layout.static
+
+    def weights(self) -> Weights:
+        """These."""
+        return self
+
+    def __getattr__(self, name: str) -> Tensor:
+        if name == "phi":
+            return self.flat[self.layout.phi]
+        if name not in MATRICES:
+            raise AttributeError(name)
+        place, shape = self.layout.places[name]
+        return self.flat[place].view(shape)
+
+    @property
+    def state_covariance(self) -> Float[Tensor, "nx nx"]:
+        """E x xᵀ over the training data; before a fit 1."""
+        return self.layout.state_covariance
+
+    @property
+    def arguments(self) -> tuple[Any, Array, Any]:
+        """Sizes, numbers and code of the map, as compiled loops take them."""
+        layout, flat = self.layout, self.flat
+        assert layout.code is not None
+        numbers = flat.numpy() if flat.dtype == torch.float64 else to_float64(flat)
+        return layout.sizes, numbers, layout.code.arguments
+
+    def internal(
+        self, u: Float[Tensor, "*axes nu"], x: Float[Tensor, "*axes nx"]
+    ) -> tuple[Float[Tensor, "*axes nz"], Float[Tensor, "*axes nw"]]:
+        """Input z and output w of the static map."""
+        z = x @ self.Cz.mT + u @ self.Dzu.mT
+        return z, self.map.of_weights(z, self.phi)
+
+    def step(
+        self, u: Float[Tensor, "*axes nu"], x: Float[Tensor, "*axes nx"]
+    ) -> Float[Tensor, "*axes nx"]:
+        """The next state."""
+        _, w = self.internal(u, x)
+        return x @ self.A.mT + u @ self.Bu.mT + w @ self.Bw.mT

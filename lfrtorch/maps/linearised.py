@@ -1,0 +1,148 @@
+"""A static map linearised at every sample: dw = J dz + (∂w/∂φ) dφ."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numba import njit
+from torch import Tensor
+from torch.func import vjp, vmap
+
+from lfrtorch._support.threads import has_kernels, spread_loop, to_float64
+from lfrtorch.maps.machine_code import Code, call_slope, prepared
+from lfrtorch.maps.static_map import StaticMap
+
+
+class LinearisedMap(Protocol):
+    """dw = J dz + (∂w/∂φ) dφ at every sample; φ are all weights of the map in their order."""
+
+    J: Float[Tensor, "R T nw nz"]
+    """∂w/∂z."""
+
+    def by_weight(self) -> Float[Tensor, "R T nw P"]:
+        """∂w/∂φ."""
+        ...
+
+    def tangent(self, d_phi: Float[Tensor, " P"]) -> Float[Tensor, "R T nw"]:
+        """(∂w/∂φ) dφ."""
+        ...
+
+    def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R P"]:
+        """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
+        ...
+
+
+def linearise_map(
+    static: StaticMap, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"], code: Code | None
+) -> LinearisedMap:
+    """A map linearised at z with the weights φ; ``code`` is its own, to save finding it again."""
+    if code is not None and static.nw and has_kernels(z):
+        return CompiledMap(z, phi, static.nw, code)
+    return TorchMap(static, z, phi)
+
+
+class TorchMap:
+    """By torch, on any device."""
+
+    def __init__(
+        self, static: StaticMap, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"]
+    ) -> None:
+        self._static, self._z, self._phi = static, z, phi
+        self.J = static.slope(z, phi)
+
+    def by_weight(self) -> Float[Tensor, "R T nw P"]:
+        """∂w/∂φ."""
+        return self._static.by_weight(self._z, self._phi)
+
+    def tangent(self, d_phi: Float[Tensor, " P"]) -> Float[Tensor, "R T nw"]:
+        """(∂w/∂φ) dφ."""
+        return self.by_weight() @ d_phi
+
+    def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R P"]:
+        """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
+        if not len(self._phi):
+            return d_w[:, 0, :0]
+
+        def one(z: Tensor, d_w: Tensor) -> Tensor:
+            return vjp(lambda phi: self._static.of_weights(z, phi), self._phi)[1](d_w)[0]
+
+        return vmap(one)(self._z, d_w)
+
+
+class CompiledMap:
+    """In machine code, which computes derivatives anew with each use: none is kept over time."""
+
+    def __init__(
+        self, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"], nw: int, code: Code
+    ) -> None:
+        self._z, self._phi, self._code, self._like = to_float64(z), to_float64(phi), code, z
+        self._shape = (*z.shape[:2], nw)
+        self.J = self._found(z.shape[2], 0)
+
+    def by_weight(self) -> Float[Tensor, "R T nw P"]:
+        """∂w/∂φ."""
+        return self._found(len(self._phi), 1)
+
+    def tangent(self, d_phi: Float[Tensor, " P"]) -> Float[Tensor, "R T nw"]:
+        """(∂w/∂φ) dφ."""
+        out = np.empty(self._shape)
+        given = self._code.arguments, self._phi, self._z, to_float64(d_phi), out
+        spread_loop(_tangent, len(out), *given)
+        return torch.from_numpy(out).to(self._like.dtype)
+
+    def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R P"]:
+        """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
+        out = np.zeros((len(d_w), len(self._phi)))
+        given = self._code.arguments, self._phi, self._z, to_float64(d_w.contiguous()), out
+        spread_loop(_adjoint, len(out), *given)
+        return torch.from_numpy(out).to(self._like.dtype)
+
+    def _found(self, columns: int, which: int) -> Tensor:
+        out = np.empty((*self._shape, columns))
+        spread_loop(_slopes, len(out), self._code.arguments, self._phi, self._z, which, out)
+        return torch.from_numpy(out).to(self._like.dtype)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _slopes(first, jobs, step, code, phi, z, which, out):
+    """Write ∂w/∂z (which = 0) or ∂w/∂φ (1) of all samples of every record of these jobs."""
+    slope, ints, constants, room = code[2], code[3], code[4], prepared(code, phi)
+    nw, P = out.shape[2], len(phi)
+    other = np.empty(nw * (P if which == 0 else z.shape[2]))
+    for r in range(first, jobs, step):
+        for k in range(z.shape[1]):
+            if which == 0:
+                call_slope(slope, ints, constants, phi, z[r, k], out[r, k], other, P, room)
+            else:
+                call_slope(slope, ints, constants, phi, z[r, k], other, out[r, k], P, room)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _tangent(first, jobs, step, code, phi, z, d_phi, out):
+    slope, ints, constants, room = code[2], code[3], code[4], prepared(code, phi)
+    nw, P = out.shape[2], len(phi)
+    J, by = np.empty(nw * z.shape[2]), np.empty((nw, P))
+    for r in range(first, jobs, step):
+        for k in range(z.shape[1]):
+            call_slope(slope, ints, constants, phi, z[r, k], J, by, P, room)
+            for q in range(nw):
+                a = 0.0
+                for n in range(P):
+                    a += by[q, n] * d_phi[n]
+                out[r, k, q] = a
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _adjoint(first, jobs, step, code, phi, z, d_w, out):
+    slope, ints, constants, room = code[2], code[3], code[4], prepared(code, phi)
+    nw, P = d_w.shape[2], len(phi)
+    J, by = np.empty(nw * z.shape[2]), np.empty((nw, P))
+    for r in range(first, jobs, step):
+        for k in range(z.shape[1]):
+            call_slope(slope, ints, constants, phi, z[r, k], J, by, P, room)
+            for q in range(nw):
+                for n in range(P):
+                    out[r, n] += by[q, n] * d_w[r, k, q]
