@@ -25,7 +25,6 @@ import torch
 
 import lfrtorch
 from lfrtorch._support.threads import spread_by_hand
-from lfrtorch.engine.sensitivity import layout
 from lfrtorch.least_squares.gauge import reduction
 from lfrtorch.least_squares.jacobian import CACHED_BYTES
 from lfrtorch.least_squares.levenberg_marquardt import LMState
@@ -90,17 +89,15 @@ def parts(folder: Path, name: str, repetitions: int = REPETITIONS) -> dict:
     problem = problems.problem(folder, name)
     state, _ = search(problem, RESTART)
     ahead = ENDLESS.step(problem, state).theta
-    problem.residual(state.theta)
-    jacobian = problem.linearise(state.theta)
+    jacobian = problem.linearise_at(state.point)
     system, gradient = jacobian.system(1.0, ENDLESS.truncation)
     residual = state.residual
 
     def simulated_anew() -> None:
-        problem.residual(ahead * next(NEARBY))
+        problem.evaluate(ahead * next(NEARBY), state.point)
 
     def linearised() -> None:
-        problem.residual(state.theta)  # kept from the repetition before
-        problem.linearise(state.theta)
+        problem.linearise_at(state.point)
 
     measured = {
         "simulation of a trial": median(simulated_anew, repetitions),
@@ -166,7 +163,8 @@ def scaling(folder: Path, axis: str, values: list[int], sizes: dict[str, int]) -
             steps += search(problem, RESTART, theta)[1]
         cell, rows = model.lfr.cell, sum(group.y.numel() for group in problem.errors.groups)
         kept = reduction(cell, torch.zeros(0, cell.nx).to(cell.A)).kept
-        by_x, _, by_y = layout(cell).columns(kept)[:3]
+        layout = cell.weights().layout
+        by_x, _, by_y = layout.direct_terms(layout.free[kept.numpy()])[:3]
         shape = {"P": model.parameter_count, "K": len(kept), "Kx": len(by_x)}
         shape |= {"Ky": len(by_y), "cached": 8 * rows * (len(kept) + 1) <= CACHED_BYTES}
         ports = {"samples": rows // cell.ny, "ports": cell.ny}
