@@ -83,7 +83,7 @@ nitpick_ignore_regex = [
     ("py:class", r"lfrtorch\.distributed\.Shared"),
     # what the engine's own functions hand each other
     ("py:class", r"lfrtorch\.engine\..*\.(Activation|Kernel|Matrices|StaticJacobian|Symbol)"),
-    ("py:class", r"lfrtorch\.engine\.known_map\..*"),
+    ("py:class", r"lfrtorch\.maps\.known_map\..*"),
 ]
 
 # To other sites: `make docs-links`.
