@@ -132,7 +132,7 @@ def estimated_start(
     white = torch.where(known[:, None, None], axes.mT / moments.sqrt().unsqueeze(-1), 0.0)
     # Nothing after the last sample with a weight tells the state.
     last = int(weight.count_nonzero(dim=(0, 2)).nonzero().max()) + 1 if counted.any() else 1
-    whole, u, y, weight = u, u[:, :last], y[:, :last], weight[:, :last]
+    whole, u, y, weight = u, u[:, :last].contiguous(), y[:, :last], weight[:, :last]
     rest = simulate(W, u, u.new_zeros(R, nx))
 
     def squares(found: Trajectory) -> Tensor:
@@ -316,10 +316,11 @@ def _factor(
     none, found = torch.zeros(0, dtype=torch.int64), []
     for block in Linearisation(W, u, at).rows(none, initial_state=True, faded=_FADED):
         records, time = block.records, block.time
-        before = found.pop() if time.start else np.zeros((len(block.rows), 0, W.nx + 1))
         rows = weight[records, time].unsqueeze(-1) * block.rows
         part = torch.cat([rows, errors[records, time].unsqueeze(-1)], dim=-1).flatten(1, 2)
-        stacked = np.concatenate([before, to_float64(part)], axis=1)
+        stacked = to_float64(part)
+        if time.start:
+            stacked = np.concatenate([found.pop(), stacked], axis=1)
         finite: Booleans = np.asarray(np.isfinite(stacked).all(axis=(1, 2)))
         # LAPACK may not end on NaN.
         stacked = stacked if finite.all() else np.where(finite[:, None, None], stacked, 0.0)

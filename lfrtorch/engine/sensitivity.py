@@ -33,6 +33,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lfrtorch._support.threads import spread_loop, workers
+from lfrtorch._support.types import Integers
 from lfrtorch.engine.blocked_kernel import blocked_rows
 from lfrtorch.engine.feedback_recurrence import states, transition
 from lfrtorch.engine.jacobian_kernel import jacobian_rows
@@ -104,11 +105,20 @@ class Linearisation:
     ) -> None:
         self.weights = W = model.weights()
         self.u, self.trajectory, self.periodic = u, trajectory, periodic
-        self.free = np.arange(len(W.flat)) if every else W.layout.free
-        self.parameters = len(self.free)
-        """P."""
+        self._every = every
         self._compiled = W.layout.compiled and u.dtype == torch.float64
         self._known_transition: tuple[Tensor, list[slice]] | None = None
+
+    @cached_property
+    def free(self) -> Integers:
+        """Positions of θ among all numbers."""
+        W = self.weights
+        return np.arange(len(W.flat)) if self._every else W.layout.free
+
+    @property
+    def parameters(self) -> int:
+        """P."""
+        return len(self.free)
 
     @property
     def state(self) -> Float[Tensor, "R nx"]:
@@ -117,6 +127,8 @@ class Linearisation:
 
     def columns(self, kept: Int[Tensor, " K"]) -> DirectTerms:
         """The direct terms of the kept parameters, given by ascending positions in θ."""
+        if not len(kept):
+            return self.weights.layout.direct_terms(np.zeros(0, np.int64))
         return self.weights.layout.direct_terms(self.free[kept.cpu().numpy()])
 
     def signals(self, records: slice, time: slice) -> Float[Tensor, "R B v"]:
@@ -164,13 +176,13 @@ class Linearisation:
                     rows = out[records, time]
                 write = self._rows_compiled if self._compiled else self._rows_generic
                 S = write(records, time, columns, S, rows)
-                if initial_state and time.stop == T:
+                if initial_state and self.periodic and time.stop == T:
                     Phi[records] = S[:, :, len(kept) :]
                     # If it has faded, fewer blocks are enough.
                     if records.stop == R and Phi.abs().amax() >= _FADED:
                         self._known_transition = Phi, self._times
                 yield Rows(records, time, rows, S)
-                if faded and S.abs().amax() < faded:
+                if faded and time.stop < T and S.abs().amax() < faded:
                     break
 
     def tangent(
@@ -344,7 +356,7 @@ class Linearisation:
         """The same in machine code; S is never stored over time, and is changed in place."""
         R, t = len(S), self.trajectory
         chunks = 1 if R % workers() == 0 else workers()
-        signals = (s.numpy() for s in (self.u, t.x, t.z, t.w))
+        signals = (np.ascontiguousarray(s.numpy()) for s in (self.u, t.x, t.z, t.w))
         kernel = blocked_rows if S.shape[1] >= MANY_STATES else jacobian_rows
         at = records.start, time.start, *columns, chunks
         spread_loop(

@@ -7,6 +7,7 @@ it is; torch takes matrices, which are views of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,6 +40,21 @@ class DirectTerms(NamedTuple):
     static: Int[Integers, " n_static"]
 
 
+_NO_TERMS = DirectTerms(*np.zeros((3, 0, 3), np.int64), np.zeros(0, np.int64))
+
+
+@lru_cache(maxsize=64)
+def _places(
+    sizes: tuple[int, int, int, int, int],
+) -> tuple[dict[str, tuple[slice, tuple[int, int]]], int]:
+    """Where the matrices of a model of these sizes stand, and where they end."""
+    size, found, at = dict(zip("xuyzw", sizes, strict=True)), {}, 0
+    for name, (left, right) in MATRICES.items():
+        shape = size[left], size[right]
+        found[name], at = (slice(at, at + shape[0] * shape[1]), shape), at + shape[0] * shape[1]
+    return found, at
+
+
 class Layout:
     """The order of a model's numbers: eight matrices, then the weights φ of the static map.
 
@@ -60,36 +76,50 @@ class Layout:
         self.sizes, self.static, self.code = sizes, static, static.code
         self.compiled = self.code is not None and has_kernels(state_covariance)
         """Whether machine code simulates the model on its device."""
-        nx, nu, ny, nz, nw = sizes
-        size = {"x": nx, "u": nu, "y": ny, "z": nz, "w": nw}
-        first_in_v = {"x": 0, "u": nx, "w": nx + nu}
-        self.places: dict[str, tuple[slice, tuple[int, int]]] = {}
-        self.spans: dict[str, slice] = {}
+        self._parameters = parameters
+        self.places, end = _places(sizes)
+        """Where each matrix stands, and its shape."""
+        self.phi = slice(end, None)
+        self._terms: dict[bytes, DirectTerms] = {}
+
+    # What follows is for derivatives alone: a simulation needs none of it.
+
+    @cached_property
+    def spans(self) -> dict[str, slice]:
         """Where each parameter stands."""
-        tables, at = [], 0
+        found, at = {}, 0
+        for name, count, _ in self._parameters:
+            found[name], at = slice(at, at + count), at + count
+        return found
+
+    @cached_property
+    def free(self) -> Integers:
+        """Positions of the free numbers, which are θ."""
+        each = [np.full(count, is_free) for _, count, is_free in self._parameters]
+        return np.flatnonzero(np.concatenate(each))
+
+    @cached_property
+    def table(self) -> Integers:
+        """Where each number acts: its equation, its row, and the signal in v that it multiplies.
+
+        The equations of x, z and y are 0, 1 and 2, and v = [x; u; w]. Weights of the map have
+        equation 3 and their position in φ.
+        """
+        nx, nu = self.sizes[:2]
+        first_in_v, tables = {"x": 0, "u": nx, "w": nx + nu}, []
         for name, (left, right) in MATRICES.items():
-            shape = size[left], size[right]
-            self.places[name] = slice(at, at + shape[0] * shape[1]), shape
-            rows, columns = np.indices(shape).reshape(2, -1)
+            rows, columns = np.indices(self.places[name][1]).reshape(2, -1)
             equation = np.full_like(rows, "xzy".index(left))
             tables.append(np.stack([equation, rows, first_in_v[right] + columns]))
-            at += shape[0] * shape[1]
-        self.phi, at = slice(at, None), 0
-        for name, count, _ in parameters:
-            self.spans[name], at = slice(at, at + count), at + count
-        positions = np.arange(at - self.phi.start)
-        self.table: Integers = np.concatenate(
-            [*tables, np.stack([np.full_like(positions, 3), positions, positions])], axis=1
-        )
-        """Of each number its equation (x, z, y: 0, 1, 2), its row and the signal in v = [x; u; w]
-        that it multiplies. Weights of the map have equation 3 and their position in φ."""
-        free = np.concatenate([np.full(count, is_free) for _, count, is_free in parameters])
-        self.free: Integers = np.flatnonzero(free)
-        """Positions of the free numbers, which are θ."""
-        self._terms: dict[bytes, DirectTerms] = {}
+        count = sum(count for _, count, _ in self._parameters) - self.phi.start
+        positions = np.arange(count)
+        tables.append(np.stack([np.full_like(positions, 3), positions, positions]))
+        return np.concatenate(tables, axis=1)
 
     def direct_terms(self, positions: Integers) -> DirectTerms:
         """The direct terms of columns for numbers at these positions, ascending."""
+        if not len(positions):
+            return _NO_TERMS
         key = positions.tobytes()
         if key not in self._terms:
             equation, row, _ = table = self.table[:, positions]
