@@ -82,8 +82,8 @@ nitpick_ignore_regex = [
     ("py:class", r"\w+"),  # an alias, or a type variable
     ("py:class", r"lfrtorch\.distributed\.Shared"),
     # what the engine's own functions hand each other
-    ("py:class", r"lfrtorch\.engine\..*\.(Activation|Kernel|Matrices|StaticJacobian|Symbol)"),
-    ("py:class", r"lfrtorch\.maps\.known_map\..*"),
+    ("py:class", r"lfrtorch\.engine\..*\.(Layout|Matrices|Weights)"),
+    ("py:class", r"lfrtorch\.maps\..*"),
 ]
 
 # To other sites: `make docs-links`.

@@ -40,7 +40,8 @@ class DirectTerms(NamedTuple):
     static: Int[Integers, " n_static"]
 
 
-_NO_TERMS = DirectTerms(*np.zeros((3, 0, 3), np.int64), np.zeros(0, np.int64))
+_NOTHING = np.zeros((0, 3), np.int64)
+_NO_TERMS = DirectTerms(_NOTHING, _NOTHING, _NOTHING, np.zeros(0, np.int64))
 
 
 @lru_cache(maxsize=64)
