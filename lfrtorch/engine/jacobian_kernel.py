@@ -16,7 +16,7 @@ from lfrtorch.engine.simulation_kernel import matrices
 from lfrtorch.maps.machine_code import call_slope, prepared
 
 _TILE = 4
-"""Rows and columns of the tiles in which matrices are multiplied."""
+"""Sums are over a multiple of so many terms; those that are added are zero."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -61,8 +61,8 @@ def _rows(
     s1 = max(min(first + len(static), c1), s0)
     whole = s1 - s0 == P > 0  # all weights of the map are this job's, in their order
     # [S(k+1); dy(k)] = M(k) X(k) with X = [S; direct terms of w] and M = [F Bw; H Dyw], padded with
-    # zeros to even rows and whole tiles. Arrays stay in place: to hand them on takes as long as a
-    # product.
+    # zeros to even rows and a multiple of ``_TILE`` columns. Arrays stay in place: to hand them on
+    # takes as long as a product.
     width, tall, depth = _padded(c1 - c0, 8), _padded(nx + ny, 2), _padded(nx + nw, _TILE)
     M, X, Y = np.zeros((tall, depth)), np.zeros((depth, width)), np.empty((tall, width))
     J, by_weight, v = np.zeros((nw, nz)), np.zeros((nw, P)), np.empty(nx + nu + nw)

@@ -3,11 +3,9 @@
 A step of the search solves a least-squares problem with J, which has a row for every sample and
 output and a column for every parameter. For long records J is too large to hold, and the step does
 not need it: a small matrix with the same JᵀJ will do. So the rows are computed block by block, each
-block is folded into an accumulator (``linear_systems``), and is then dropped. Columns that are
-combinations of others (``gauge``) are not computed at all.
-
-If the rows take little memory they are cached, and J dθ and Jᵀ e are products with them. Otherwise
-each product is a recurrence over the records (``sensitivity``).
+block is folded into an accumulator (``linear_systems``), and is then dropped. Where that saves
+time, columns that are combinations of others (``gauge``) are not computed. ``output_rows`` has the
+rows of simulated outputs.
 """
 
 from __future__ import annotations

@@ -31,9 +31,6 @@ SLOPE = types.void(
 """A slope: (ints, constants, weights, z, J, by_weight, stride, room) -> None, which writes ∂w/∂z
 (nw, nz) and ∂w/∂weights (nw, P), whose rows are ``stride`` numbers apart."""
 
-FORMULA = types.void(_DOUBLES, _DOUBLES)
-"""A formula: (v, out) -> None."""
-
 
 class Code(NamedTuple):
     """A static map for compiled loops.
