@@ -43,8 +43,8 @@ def start_error(model: Model, record: Record, y_hat: Float[Array, "T ny"]) -> fl
         return None
     cell, u = double(model.lfr.cell), torch.as_tensor(model.scaler.normalise_u(record.u))
     F, H = linearise(cell, model.signals(record).z[:, :T].double())
-    moments, axes = torch.linalg.eigh(state_moments(cell, u.unsqueeze(0)))
-    root = axes * moments.clamp_min(0.0).sqrt().unsqueeze(1)
+    moments, axes = np.linalg.eigh(state_moments(cell, u.unsqueeze(0)))
+    root = torch.from_numpy(axes * np.sqrt(np.maximum(moments, 0.0))[:, None])
     free = (H @ linear_recurrence(F, torch.zeros_like(F), root)[:, :-1])[0].numpy()
     weight, scale = record.start_factors[:N], model.scaler.y_scale
     errors = np.sqrt(record.weight) / scale * record.errors(y_hat)

@@ -2,37 +2,38 @@
 
 An output tells the initial state until the last sample with a weight, and no longer than until the
 transition Φ(k) = ∂x(k)/∂x(0) has faded. Later samples cost nothing here but, before a fit, one
-simulation from rest.
+simulation from rest. ``start_kernel`` has the search; a model whose map has no machine code takes
+its steps for all records at once.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from lfrtorch._support.threads import to_float64
-from lfrtorch._support.types import Array, Booleans
+from lfrtorch._support.threads import spread_loop, to_float64
+from lfrtorch._support.types import Array, Booleans, Integers
 from lfrtorch.engine.linearised import linearise
 from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulation import Numbers, Trajectory, simulate, simulate_near
+from lfrtorch.engine.start_kernel import (
+    FADED,
+    HALVINGS,
+    ITERATIONS,
+    PASSES,
+    SEEN,
+    TOLERANCE,
+    fit_starts,
+    step_of,
+)
 from lfrtorch.engine.weights import Weights
 
-ITERATIONS, _HALVINGS, _TOLERANCE = 20, 6, 1e-8
-"""Most Gauss-Newton steps, trials in a step, and the relative decrease that ends the search."""
-
-_SEEN = 1e-9
-"""A direction of the initial state is estimated if it moves the weighted output by this much."""
-
-_FADED = 1e-12
-"""Part of an initial state that the output cannot tell: far below ``_SEEN``."""
-
-PASSES, _FLAT = 8, 1e-4
-"""Passes that estimate the prior's weight, and its least variance relative to the largest."""
+_FLAT = 1e-4
+"""Least variance of the prior relative to the largest."""
 
 _ODD = 1e-3
 """Least part of the cost that the prior adds if it makes a difference."""
@@ -52,6 +53,7 @@ _BEGINNING = 8
 
 
 @torch.no_grad()
+@np.errstate(over="ignore", invalid="ignore")
 def start_from_beginning(
     model: Numbers,
     u: Float[Tensor, "R T nu"],
@@ -64,21 +66,15 @@ def start_from_beginning(
     has few. A beginning's state is refined on the whole record, and taken if the squared error is
     far less.
     """
-
     W = model.weights()
-
-    def squares(trajectory: Trajectory) -> Tensor:
-        return (weight * (trajectory.y - y)).square().sum(dim=(1, 2)).nan_to_num(math.inf)
-
     best, T = simulate(W, u, estimated_start(W, u, y, weight)), u.shape[1] // 2
     while T * W.ny >= _BEGINNING * W.nx:
         begun = estimated_start(W, u[:, :T], y[:, :T], weight[:, :T])
         found = simulate_near(W, u, begun, best)
-        better = squares(found) < _FAR_BETTER * squares(best)
+        least, squares = _squares(weight, best, y), _squares(weight, found, y)
+        better = np.asarray(squares < _FAR_BETTER * np.nan_to_num(least, nan=np.inf))
         if better.any():
-            found = _fitted_start(W, u, y, weight, found)
-            pairs = zip(found, best, strict=True)
-            best = Trajectory(*(torch.where(better[:, None, None], a, b) for a, b in pairs))
+            best = _chosen(better, _fitted_start(W, u, y, weight, found), best)
         T //= 2
     return best.x[:, 0]
 
@@ -96,14 +92,15 @@ def measured_start(
         H = linearise(W, z.unsqueeze(1)).H.squeeze(1)
         if not torch.isfinite(H).all():
             break
-        step = (torch.linalg.pinv(H, rtol=_SEEN) @ error.unsqueeze(-1)).squeeze(-1)
+        step = (torch.linalg.pinv(H, rtol=SEEN) @ error.unsqueeze(-1)).squeeze(-1)
         x = x + step
-        if not (step.abs() > _TOLERANCE * (1.0 + x.abs())).any():
+        if not (step.abs() > TOLERANCE * (1.0 + x.abs())).any():
             break
     return x
 
 
 @torch.no_grad()
+@np.errstate(over="ignore", invalid="ignore")
 def estimated_start(
     model: Numbers,
     u: Float[Tensor, "R T nu"],
@@ -123,78 +120,73 @@ def estimated_start(
     its errors are less than those from rest.
     """
     W = model.weights()
-    R, nx = len(u), W.nx
-    counted = (weight != 0).sum(dim=(1, 2))
+    nx, factors = W.nx, to_float64(weight)
+    counted = np.count_nonzero(factors, axis=(1, 2))
     # Prior: P = axes diag(moments) axesᵀ, so that |white x0|² = x0ᵀ P⁻¹ x0.
-    moments, axes = torch.linalg.eigh(state_moments(W, u))
-    known = moments[:, -1] > 0
-    moments = torch.where(known[:, None], moments.clamp_min(_FLAT * moments[:, -1:]), 1.0)
-    white = torch.where(known[:, None, None], axes.mT / moments.sqrt().unsqueeze(-1), 0.0)
+    moments, axes = np.linalg.eigh(state_moments(W, u))
+    known: Booleans = np.asarray(moments[:, -1] > 0.0)
+    moments = np.where(known[:, None], np.maximum(moments, _FLAT * moments[:, -1:]), 1.0)
+    deviations = np.sqrt(moments)[:, None]
+    white = (axes / deviations).swapaxes(1, 2) * known[:, None, None]
     # Nothing after the last sample with a weight tells the state.
-    last = int(weight.count_nonzero(dim=(0, 2)).nonzero().max()) + 1 if counted.any() else 1
+    last = 1 + int(np.flatnonzero(factors.any(axis=(0, 2))).max(initial=0))
     whole, u, y, weight = u, u[:, :last].contiguous(), y[:, :last], weight[:, :last]
-    rest = simulate(W, u, u.new_zeros(R, nx))
-
-    def squares(found: Trajectory) -> Tensor:
-        return (weight * (found.y - y)).square().sum(dim=(1, 2))
-
+    rest = simulate(W, u, None)
+    at_rest = _squares(weight, rest, y)
     first, settled = rest, False
     if near is not None:
         there = simulate(W, u, near)
-        closer = squares(there) < squares(rest)  # False for NaN
+        closer: Booleans = np.asarray(_squares(weight, there, y) < at_rest)  # False for NaN
         settled = bool(closer.all())
-        pairs = zip(there, rest, strict=True)
-        first = Trajectory(*(torch.where(closer[:, None, None], a, b) for a, b in pairs))
+        first = _chosen(closer, there, rest)
     free = _fitted_start(W, u, y, weight, first)
-    stayed = ~free.x[:, 0].any(dim=1)  # Gauss-Newton may fail on many states
-    odd = (white @ free.x[:, 0].unsqueeze(-1)).square().sum(dim=(1, 2))
-    if not (known & (stayed | (odd > _ODD * counted))).any():
-        return _staying(W, whole, free.x, white)
-    variance = squares(rest).nan_to_num(0.0, 0.0) / counted.clamp_min(1)
-    spread = axes * moments.sqrt().unsqueeze(-2)
-    prior = _Prior(*map(to_float64, (white, spread, variance, counted)))
-    probable = _fitted_start(W, u, y, weight, first, prior, settled=settled)
-    lost = ~torch.isfinite(squares(probable))
-    better = ~known | lost | ((squares(free) < _FAR * squares(probable)) & (counted > 2 * nx))
-    found = torch.where(better[:, None, None], free.x, probable.x)
-    return _staying(W, whole, found, white)
+    x0 = to_float64(free.x[:, 0])
+    stayed = ~x0.any(axis=1)  # Gauss-Newton may fail on many states
+    odd = ((white @ x0[..., None]) ** 2).sum(axis=(1, 2)) > _ODD * counted
+    found = free
+    if (known & (stayed | odd)).any():
+        variance = np.nan_to_num(at_rest, nan=0.0, posinf=0.0) / np.maximum(counted, 1)
+        prior = _Prior(white, axes * deviations, variance, counted)
+        probable = _fitted_start(W, u, y, weight, first, prior, settled=settled)
+        squares = _squares(weight, probable, y)
+        far = (_squares(weight, free, y) < _FAR * squares) & (counted > 2 * nx)
+        found = _chosen(~known | ~np.isfinite(squares) | far, free, probable)
+    return found.x[:, 0] if last == len(whole[0]) else _staying(W, whole, found.x, white)
 
 
 def _staying(
     W: Weights,
     u: Float[Tensor, "R T nu"],
     x: Float[Tensor, "R S nx"],
-    white: Float[Tensor, "R nx nx"],
+    white: Float[Array, "R nx nx"],
 ) -> Float[Tensor, "R nx"]:
     """The first of the states x, or 0 if the model runs away after them and not from 0."""
 
-    def farthest(states: Tensor) -> Tensor:
-        return (states @ white.mT).square().sum(dim=2).amax(dim=1).nan_to_num(math.inf)
+    def farthest(states: Tensor) -> Array:
+        sizes = ((to_float64(states) @ white.swapaxes(1, 2)) ** 2).sum(axis=2).max(axis=1)
+        return np.nan_to_num(sizes, nan=np.inf, posinf=np.inf)
 
-    near, x0 = farthest(x), x[:, 0]
-    if u.shape[1] < x.shape[1]:
-        return x0
-    there = farthest(simulate(W, u, x0).x)
-    away = there > _AWAY * near
+    near, x0 = _AWAY * farthest(x), x[:, 0]
+    away: Booleans = np.asarray(farthest(simulate(W, u, x0).x) > near)
     if away.any():
-        away &= there > _AWAY * farthest(simulate(W, u, torch.zeros_like(x0)).x)
-    return torch.where(away.unsqueeze(1), 0.0, x0)
+        away &= ~(farthest(simulate(W, u, None).x) > near)
+    return torch.where(torch.from_numpy(away).to(x0.device)[:, None], 0.0, x0)
 
 
-def state_moments(model: Numbers, u: Float[Tensor, "R T nu"]) -> Float[Tensor, "R nx nx"]:
+def state_moments(model: Numbers, u: Float[Tensor, "R T nu"]) -> Float[Array, "R nx nx"]:
     """E x xᵀ, about 0, that initial states have before an output is known.
 
     It is the covariance of the states over the training data. Before a fit, when that is 1, it is
     the second moment of the states that the input excites from rest: 0 if the model diverges.
     """
     W = model.weights()
-    P = W.state_covariance
-    if not torch.equal(P, torch.eye(W.nx).to(P)):
-        return P.expand(len(u), -1, -1)
-    x = simulate(W, u, u.new_zeros(len(u), W.nx)).x
-    lost = ~torch.isfinite(x).all(dim=(1, 2))
-    x = torch.where(lost[:, None, None], 0.0, x)
-    return x.mT @ x / x.shape[1]
+    P = to_float64(W.state_covariance)
+    if not np.array_equal(P, np.eye(W.nx)):
+        return np.broadcast_to(P, (len(u), W.nx, W.nx))
+    x = to_float64(simulate(W, u, None).x)
+    lost = ~np.isfinite(x).all(axis=(1, 2))
+    x = np.where(lost[:, None, None], 0.0, x) if lost.any() else x
+    return x.swapaxes(1, 2) @ x / x.shape[1]
 
 
 class _Prior(NamedTuple):
@@ -203,29 +195,7 @@ class _Prior(NamedTuple):
     white: Float[Array, "R nx nx"]
     spread: Float[Array, "R nx nx"]  # its inverse
     variance: Float[Array, " R"]  # at rest: the largest
-    counted: Float[Array, " R"]  # errors
-
-    def weight(
-        self,
-        passes: int,
-        rows: Float[Array, "R n nx"],
-        errors: Float[Array, "R n 1"],
-        x0: Float[Array, "R nx 1"],
-    ) -> Float[Array, " R"]:
-        """v after so many passes, each with the states that the linear model has at the last v."""
-        variance = self.variance
-        if passes == 1:
-            return variance
-        U, S, _ = np.linalg.svd(rows @ self.spread, full_matrices=False)
-        errors = errors - rows @ x0
-        along = (U.swapaxes(1, 2) @ errors)[..., 0]
-        beside = np.maximum((errors**2).sum(axis=(1, 2)) - (along**2).sum(axis=1), 0.0)
-        squares, counted = S**2, np.maximum(self.counted, 1)
-        for _ in range(passes - 1):
-            v = variance[:, None]
-            left = np.divide(along * v, squares + v, out=np.zeros_like(along), where=v > 0)
-            variance = ((left**2).sum(axis=1) + beside) / counted
-        return variance
+    counted: Int[Integers, " R"]  # errors
 
 
 def _fitted_start(
@@ -243,66 +213,78 @@ def _fitted_start(
     Gauss-Newton from ``best``; a step that does not lower the cost is quartered. The prior's weight
     comes down from its largest in the first steps, unless the search begins ``settled``.
     """
-    # Matrices of some ten numbers are numpy's, which is quicker to call than torch.
-    x0, v = to_float64(best.x[:, 0])[..., None], np.zeros(len(u))
-    seen = _SEEN * float(weight.abs().amax())
-    tolerance = max(_TOLERANCE, torch.finfo(u.dtype).eps)
-    errors = weight * (best.y - y)
+    if prior is None:
+        none = np.zeros((len(u), W.nx, W.nx))
+        prior = _Prior(none, none, np.zeros(len(u)), np.zeros(len(u), np.int64))
+        passes = 0
+    else:
+        passes = PASSES if settled else 1
+    if not W.layout.compiled:
+        return _fitted_by_torch(W, u, y, weight, best, prior, passes)
+    found = [to_float64(signal).copy() for signal in best]
+    given = [to_float64(signal) for signal in (u, y, weight)]
+    spread_loop(fit_starts, len(u), *W.arguments, *given, *prior, passes, *found)
+    return Trajectory(*(torch.from_numpy(signal).to(u) for signal in found))
 
-    def penalty(x0: Array) -> Array:
-        return np.zeros(len(x0)) if prior is None else v * ((prior.white @ x0) ** 2).sum((1, 2))
 
-    for k in range(ITERATIONS):
-        rows, left = _factor(W, u, weight, errors, best)
-        passes = PASSES if prior is None or settled else min(2**k, PASSES)
-        usable: Booleans = np.asarray(np.isfinite(rows).all(axis=(1, 2)))
-        if not usable.all():
-            rows, left = (np.where(usable[:, None, None], part, 0.0) for part in (rows, left))
-        if prior is not None:
-            v = prior.weight(passes, rows, left, x0)
-            scaled = prior.white * np.sqrt(v)[:, None, None]
-            rows = np.concatenate([rows, scaled], axis=1)
-            left = np.concatenate([left, scaled @ x0], axis=1)
-        cost = before = _squares(errors) + penalty(x0)
-        # A state that the output does not show stays where it is.
-        U, S, Vh = np.linalg.svd(rows, full_matrices=False)
-        told = np.maximum(seen, _SEEN * S[:, :1]) < S
-        inverse = np.divide(1.0, S, out=np.zeros_like(S), where=told)[..., None]
-        step = -(Vh.swapaxes(1, 2) @ (inverse * (U.swapaxes(1, 2) @ left)))
+def _fitted_by_torch(
+    W: Weights,
+    u: Float[Tensor, "R T nu"],
+    y: Float[Tensor, "R T ny"],
+    weight: Float[Tensor, "R T ny"],
+    best: Trajectory,
+    prior: _Prior,
+    passes: int,
+) -> Trajectory:
+    """``fit_starts`` of all records at once."""
+    x0, v = to_float64(best.x[:, 0]).copy(), np.zeros(len(u))
+    seen = SEEN * to_float64(weight.abs().amax(dim=(1, 2)))
+    tolerance = max(TOLERANCE, torch.finfo(u.dtype).eps)
+    squares = _squares(weight, best, y)
+
+    def costs(x0: Array, squares: Array) -> Array:
+        return squares + v * ((prior.white @ x0[..., None]) ** 2).sum(axis=(1, 2))
+
+    for _ in range(ITERATIONS):
+        L, usable = _factor(W, u, weight, weight * (best.y - y), best)
+        step, promised = np.zeros_like(x0), np.zeros(len(u))
+        for r in np.flatnonzero(usable & np.isfinite(squares)):
+            own = (part[r] for part in prior)
+            step[r], promised[r], v[r] = step_of(L[r], squares[r], x0[r], *own, passes, seen[r])
+        cost = before = costs(x0, squares)
         # A step that should hardly lower the cost is not worth a trial.
-        promised = ((rows @ step) ** 2).sum(axis=(1, 2))
-        waiting = usable & np.isfinite(cost) & (promised > tolerance * cost)
-        if passes == PASSES and not waiting.any():
-            break
-        for _ in range(_HALVINGS):
+        waiting = promised > tolerance * cost  # False for NaN
+        for _ in range(HALVINGS):
             if not waiting.any():
                 break
-            trial = simulate_near(W, u, torch.from_numpy((x0 + step)[..., 0]).to(u), best)
-            trial_errors = weight * (trial.y - y)
-            trial_cost = _squares(trial_errors) + penalty(x0 + step)
-            better = waiting & (trial_cost < cost)  # False for NaN
-            x0 = np.where(better[:, None, None], x0 + step, x0)
-            cost = np.where(better, trial_cost, cost)
+            trial = simulate(W, u, torch.from_numpy(x0 + step).to(u), guess=best.x)
+            reached = _squares(weight, trial, y)
+            better = waiting & (costs(x0 + step, reached) < cost)  # False for NaN
+            x0 = np.where(better[:, None], x0 + step, x0)
+            squares = np.where(better, reached, squares)
+            cost = np.where(better, costs(x0, squares), cost)
             best = _chosen(better, trial, best)
-            errors = trial_errors if better.all() else weight * (best.y - y)
-            waiting &= ~better
-            step = step / 4
-        if passes == PASSES and not (cost < (1.0 - tolerance) * before).any():
+            waiting, step = waiting & ~better, step / 4.0
+        if passes in (0, PASSES) and not (cost < (1.0 - tolerance) * before).any():
             break
+        passes = min(2 * passes, PASSES)
     return best
 
 
-def _squares(errors: Float[Tensor, "R T ny"]) -> Float[Array, " R"]:
-    """The sum of squares of each record."""
-    return to_float64(errors.square().sum(dim=(1, 2)))
+def _squares(
+    weight: Float[Tensor, "R T ny"], found: Trajectory, y: Float[Tensor, "R T ny"]
+) -> Float[Array, " R"]:
+    """The weighted sum of squared errors of each record."""
+    errors = to_float64(weight) * (to_float64(found.y) - to_float64(y))
+    return np.einsum("rti,rti->r", errors, errors)
 
 
-def _chosen(better: Booleans, trial: Trajectory, best: Trajectory) -> Trajectory:
-    """The trial for records where it is better."""
-    if better.all() or not better.any():
-        return trial if better.all() else best
-    taken = torch.from_numpy(better).to(best.x.device)[:, None, None]
-    return Trajectory(*(torch.where(taken, t, b) for t, b in zip(trial, best, strict=True)))
+def _chosen(which: Booleans, these: Trajectory, others: Trajectory) -> Trajectory:
+    """The trajectories of some records, and others for the rest."""
+    if which.all() or not which.any():
+        return these if which.all() else others
+    mask = torch.from_numpy(which).to(these.x.device)[:, None, None]
+    return Trajectory(*(torch.where(mask, *pair) for pair in zip(these, others, strict=True)))
 
 
 def _factor(
@@ -311,22 +293,16 @@ def _factor(
     weight: Float[Tensor, "R T ny"],
     errors: Float[Tensor, "R T ny"],
     at: Trajectory,
-) -> tuple[Float[Array, "R n nx"], Float[Array, "R n 1"]]:
-    """R of the QR of [derivative by x0 | errors], weighted; NaN if it is not finite."""
-    none, found = torch.zeros(0, dtype=torch.int64), []
-    for block in Linearisation(W, u, at).rows(none, initial_state=True, faded=_FADED):
-        records, time = block.records, block.time
-        rows = weight[records, time].unsqueeze(-1) * block.rows
-        part = torch.cat([rows, errors[records, time].unsqueeze(-1)], dim=-1).flatten(1, 2)
-        stacked = to_float64(part)
-        if time.start:
-            stacked = np.concatenate([found.pop(), stacked], axis=1)
-        finite: Booleans = np.asarray(np.isfinite(stacked).all(axis=(1, 2)))
+) -> tuple[Float[Array, "R n n"], Booleans]:
+    """L with L Lᵀ = Mᵀ M for M = [derivative by x0 | errors], weighted, and where it is finite."""
+    none, found = torch.zeros(0, dtype=torch.int64), u.new_zeros(len(u), W.nx + 1, W.nx + 1)
+    for block in Linearisation(W, u, at).rows(none, initial_state=True, faded=FADED):
+        rows = weight[:, block.time].unsqueeze(-1) * block.rows
+        part = torch.cat([rows, errors[:, block.time].unsqueeze(-1)], dim=-1).flatten(1, 2)
+        stacked = torch.cat([found, part], dim=1)
+        finite = torch.isfinite(stacked).all(dim=2).all(dim=1)[:, None, None]
         # LAPACK may not end on NaN.
-        stacked = stacked if finite.all() else np.where(finite[:, None, None], stacked, 0.0)
-        folded: Array = np.asarray(np.linalg.qr(stacked, mode="r"))
-        folded[~finite] = np.nan
-        found.append(folded)
-    # Records of few samples have factors of fewer rows.
-    whole = np.concatenate(found)
-    return whole[..., :-1], whole[..., -1:]
+        R = torch.linalg.qr(torch.where(finite, stacked, 0.0), mode="r").R
+        found = torch.where(finite, R, torch.nan)
+    L = to_float64(found.mT)
+    return L, np.asarray(np.isfinite(L).all(axis=(1, 2)))

@@ -24,32 +24,36 @@ def jacobian_rows(
     first, jobs, step, sizes, weights, code, u, x, z, w, r0, t0,
     x_entries, z_entries, y_entries, static, chunks, S, rows,
 ):  # fmt: skip
-    """``_rows`` of every job first, first + step, ... below ``jobs``."""
-    for job in range(first, jobs, step):
-        _rows(
-            job, sizes, weights, code, u, x, z, w, r0, t0, x_entries, z_entries, y_entries, static,
-            chunks, S, rows,
-        )  # fmt: skip
+    """``record_rows`` of every job first, first + step, ... below ``jobs``.
 
-
-@njit(nogil=True, error_model="numpy", fastmath={"contract"})
-def _rows(
-    job, sizes, weights, code, u, x, z, w, r0, t0,
-    x_entries, z_entries, y_entries, static, chunks, S, rows,
-):  # fmt: skip
-    """Write the rows of one record and one chunk of the columns; S goes on to the block's end.
-
-    Job r * chunks + c is chunk c of the columns of record r0 + r, from sample t0 on. Entries are
-    those of ``sensitivity.DirectTerms``.
+    Job r * chunks + c is chunk c of the columns of record r0 + r.
 
     Shape:
         S: (R, nx, C), rows: (R, B, ny, at least C).
     """
+    for job in range(first, jobs, step):
+        r, chunk, C = job // chunks, job % chunks, S.shape[2]
+        record_rows(
+            sizes, weights, code, u[r0 + r], x[r0 + r], z[r0 + r], w[r0 + r], t0,
+            x_entries, z_entries, y_entries, static, C * chunk // chunks,
+            C * (chunk + 1) // chunks, S[r], rows[r],
+        )  # fmt: skip
+
+
+@njit(nogil=True, error_model="numpy", fastmath={"contract"})
+def record_rows(
+    sizes, weights, code, u, x, z, w, t0,
+    x_entries, z_entries, y_entries, static, c0, c1, S, rows,
+):  # fmt: skip
+    """Write columns c0 to c1 of the rows of a record from sample t0; S goes on to the block's end.
+
+    Entries are those of ``sensitivity.DirectTerms``.
+
+    Shape:
+        S: (nx, C), rows: (B, ny, at least C).
+    """
     A, _, Bw, Cz, _, Cy, _, Dyw, phi = matrices(sizes, weights)
-    r, chunk = job // chunks, job % chunks
-    B, ny, C = rows.shape[1], rows.shape[2], S.shape[2]
-    c0, c1 = C * chunk // chunks, C * (chunk + 1) // chunks
-    u, x, z, w, rows, S = u[r0 + r], x[r0 + r], z[r0 + r], w[r0 + r], rows[r], S[r]
+    B, ny = rows.shape[0], rows.shape[1]
     (nx, nw), nz, nu, P = Bw.shape, len(Cz), u.shape[1], len(phi)
     slope, ints, constants, room = code[2], code[3], code[4], prepared(code, phi)
     x_own, z_own, y_own = (

@@ -27,6 +27,7 @@ import numpy as np
 from numba import njit
 
 from lfrtorch.engine.simulation_kernel import affine, matrices
+from lfrtorch.engine.small_matrices import reflect
 from lfrtorch.maps.machine_code import call_slope, call_value, prepared
 
 
@@ -109,7 +110,7 @@ def correct(e, H, G, x, U, w_hat):
         for j in range(total):
             M[known + nx + i, j] = G[ny + i, j]
         w_hat[i] = 0.0
-    _reflect(M, known)
+    reflect(M, known)
     log_p = 0.0
     for a in range(known):
         for b in range(a):
@@ -131,36 +132,10 @@ def propagate(F, M, known, U):
         for n in range(nx):
             for j in range(N.shape[1]):
                 N[i, j] += F[i, n] * M[known + n, known + j]
-    _reflect(N, nx)
+    reflect(N, nx)
     for i in range(nx):
         for j in range(nx):
             U[i, j] = N[i, j]
-
-
-@njit(nogil=True, error_model="numpy")
-def _reflect(M, rows):
-    """M times an orthogonal matrix, in place, that makes its first rows lower triangular."""
-    for k in range(rows):
-        square = 0.0
-        for j in range(k, M.shape[1]):
-            square += M[k, j] * M[k, j]
-        if square == 0.0:
-            continue
-        # The mirror image of row k has -sign(M_kk) |row| on the diagonal; v is their difference.
-        diagonal = -math.copysign(math.sqrt(square), M[k, k])
-        v = M[k, k] - diagonal
-        scale = 1.0 / (square - diagonal * M[k, k])  # 2 / |v|²
-        for i in range(k + 1, len(M)):
-            a = M[i, k] * v
-            for j in range(k + 1, M.shape[1]):
-                a += M[i, j] * M[k, j]
-            a *= scale
-            M[i, k] -= a * v
-            for j in range(k + 1, M.shape[1]):
-                M[i, j] -= a * M[k, j]
-        M[k, k] = diagonal
-        for j in range(k + 1, M.shape[1]):
-            M[k, j] = 0.0
 
 
 @njit(nogil=True, error_model="numpy")

@@ -30,21 +30,20 @@ def matrices(sizes, weights):
 def simulate_records(first, jobs, step, sizes, weights, code, u, met_within, x, z, w, y):
     """``simulate_record`` of every record first, first + step, ... below ``jobs``."""
     for r in range(first, jobs, step):
-        simulate_record(r, sizes, weights, code, u, met_within, x, z, w, y)
+        simulate_record(sizes, weights, code, u[r], met_within, x[r], z[r], w[r], y[r])
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"})
-def simulate_record(r, sizes, weights, code, u, met_within, x, z, w, y):
-    """Simulate record r: write its signals over those in x, z, w and y.
+def simulate_record(sizes, weights, code, u, met_within, x, z, w, y):
+    """Simulate a record from x[0]: write its signals over those in x, z, w and y.
 
     It stops once a state agrees, within ``met_within``, with the one that it would overwrite: the
     rest of the earlier trajectory then holds for this one, too. Below 0 none agrees.
 
     Shape:
-        x: (R, T + 1, nx), u: (R, T, nu), z: (R, T, nz), w: (R, T, nw), y: (R, T, ny).
+        x: (T + 1, nx), u: (T, nu), z: (T, nz), w: (T, nw), y: (T, ny).
     """
     A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, phi = matrices(sizes, weights)
-    u, x, z, w, y = u[r], x[r], z[r], w[r], y[r]
     value, ints, constants, room = code[1], code[3], code[4], prepared(code, phi)
     for k in range(len(u)):
         affine(Cz, x[k], Dzu, u[k], z[k])
