@@ -14,11 +14,11 @@ TANH, SIGMOID, RELU, RBF, SOFTPLUS = range(5)
 
 
 @njit(nogil=True, fastmath={"contract", "reassoc"})
-def dot(a, b):
-    """Inner product; sums in any order become vector instructions, the states' sums keep theirs."""
+def dot(x, a, y, b, count):
+    """Inner product of x from a on and y from b on; sums in any order are vector instructions."""
     total = 0.0
-    for n in range(len(a)):
-        total += a[n] * b[n]
+    for n in range(count):
+        total += x[a + n] * y[b + n]
     return total
 
 
@@ -28,50 +28,91 @@ instructions, twice as fast as over 15 neurons."""
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"})
-def activate(activation, v, h):
-    """h = σ(v) of all neurons, in loops that the compiler turns into vector instructions."""
-    # A division that is checked for zero stays one instruction for each number: numpy's errors.
+def hidden(activation, nz, lanes, room, z, v):
+    """σ(v) and σ'(v) of all neurons with v = Wz z + bz, after room for v, which may stay empty.
+
+    Args:
+        room: Wzᵀ and bz, each of so many ``lanes``, at its beginning.
+        v: where v stands in it.
+    """
+    # The compiler turns loops over all neurons into vector instructions. σ stands in the loop that
+    # makes v: vectors that were stored in one loop and are read in the next take 20 ns to arrive.
+    # Numbers are found by their place: a view takes 2 ns to make.
     if activation == TANH:
-        for n in range(len(h)):
-            e = _exp(-2.0 * abs(v[n]))
-            t = math.copysign((1.0 - e) / (1.0 + e), v[n])
-            h[n] = t if v[n] == v[n] else v[n]  # NaN stays
+        _over(_tanh, nz, lanes, room, z, v)
     elif activation == SIGMOID:
-        for n in range(len(h)):
-            e = _exp(-abs(v[n]))
-            t = (1.0 if v[n] > 0.0 else e) / (1.0 + e)
-            h[n] = t if v[n] == v[n] else v[n]
+        _over(_sigmoid, nz, lanes, room, z, v)
     elif activation == RELU:
-        for n in range(len(h)):
-            h[n] = max(v[n], 0.0)
+        _over(_relu, nz, lanes, room, z, v)
     elif activation == RBF:
-        for n in range(len(h)):
-            t = _exp(-v[n] * v[n])
-            h[n] = t if v[n] == v[n] else v[n]
+        _over(_rbf, nz, lanes, room, z, v)
     else:
-        for n in range(len(h)):
-            t = max(v[n], 0.0) + math.log1p(_exp(-abs(v[n])))
-            h[n] = t if v[n] == v[n] else v[n]
+        _over(_softplus, nz, lanes, room, z, v)
 
 
-@njit(nogil=True, error_model="numpy", fastmath={"contract"})
-def slopes(activation, v, h, s):
-    """s = σ'(v) of all neurons with h = σ(v)."""
-    if activation == TANH:
-        for n in range(len(s)):
-            s[n] = 1.0 - h[n] * h[n]
-    elif activation == SIGMOID:
-        for n in range(len(s)):
-            s[n] = h[n] * (1.0 - h[n])
-    elif activation == RELU:
-        for n in range(len(s)):
-            s[n] = 1.0 if v[n] > 0.0 else 0.0
-    elif activation == RBF:
-        for n in range(len(s)):
-            s[n] = -2.0 * v[n] * h[n]
+@njit(nogil=True, inline="always")
+def _over(sigma, nz, lanes, room, z, v):
+    """``hidden`` of one activation."""
+    bz, h = nz * lanes, v + lanes
+    s, z0 = h + lanes, z[0]
+    if nz == 1:
+        for n in range(lanes):
+            room[h + n], room[s + n] = sigma(room[bz + n] + room[n] * z0)
+    elif nz == 2:
+        z1 = z[1]
+        for n in range(lanes):
+            both = room[bz + n] + room[n] * z0 + room[lanes + n] * z1
+            room[h + n], room[s + n] = sigma(both)
     else:
-        for n in range(len(s)):
-            s[n] = 1.0 / (1.0 + math.exp(-v[n]))
+        z1 = z[1]
+        for n in range(lanes):
+            room[v + n] = room[bz + n] + room[n] * z0 + room[lanes + n] * z1
+        for j in range(2, nz):
+            zj = z[j]
+            for n in range(lanes):
+                room[v + n] += room[j * lanes + n] * zj
+        for n in range(lanes):
+            room[h + n], room[s + n] = sigma(room[v + n])
+
+
+# σ(v) and σ'(v) of one neuron; NaN stays. A division that is checked for zero would stay one
+# instruction for each neuron: callers have numpy's errors.
+
+
+@njit(nogil=True, inline="always")
+def _tanh(v):
+    e = _exp(-2.0 * abs(v))
+    t = math.copysign((1.0 - e) / (1.0 + e), v)
+    h = t if v == v else v  # noqa: PLR0124
+    return h, 1.0 - h * h
+
+
+@njit(nogil=True, inline="always")
+def _sigmoid(v):
+    e = _exp(-abs(v))
+    t = (1.0 if v > 0.0 else e) / (1.0 + e)
+    h = t if v == v else v  # noqa: PLR0124
+    return h, h * (1.0 - h)
+
+
+@njit(nogil=True, inline="always")
+def _relu(v):
+    return max(v, 0.0), 1.0 if v > 0.0 else 0.0
+
+
+@njit(nogil=True, inline="always")
+def _rbf(v):
+    t = _exp(-v * v)
+    h = t if v == v else v  # noqa: PLR0124
+    return h, -2.0 * v * h
+
+
+@njit(nogil=True, inline="always")
+def _softplus(v):
+    e = _exp(-abs(v))
+    t = max(v, 0.0) + math.log1p(e)
+    h = t if v == v else v  # noqa: PLR0124
+    return h, (1.0 if v > 0.0 else e) / (1.0 + e)
 
 
 def _cast(kind: Any, to: Any) -> Any:

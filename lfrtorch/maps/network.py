@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit
-from numba.np.numpy_support import carray
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -17,7 +15,7 @@ from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
-from lfrtorch.maps.activation_kernel import LANES, activate, dot, slopes
+from lfrtorch.maps.activation_kernel import LANES, dot, hidden
 from lfrtorch.maps.activations import ACTIVATIONS, Activation
 from lfrtorch.maps.enclosure import Enclosure, Interval, Layer
 from lfrtorch.maps.machine_code import PREPARE, SLOPE, Code, address
@@ -238,76 +236,60 @@ class Network(StaticMap):
 
 
 # The room has the weights with zeros for neurons up to a multiple of ``LANES``: Wzᵀ, bz and Ww, row
-# by row, and then v, h and s.
-
-
-@njit(nogil=True, inline="always")
-def _places(ints, room):
-    nz, nw, lanes = ints[0], ints[1], ints[4]
-    inside = carray(room, ((nz + nw + 4) * lanes,)).reshape((nz + nw + 4, lanes))
-    return inside[:nz], inside[nz], inside[nz + 1 : nz + 1 + nw], inside[nz + 1 + nw :]
+# by row, and then v, h = σ(v) and s = σ'(v).
 
 
 def _prepare(ints, constants, weights, room):
-    nz, nw, nn = ints[0], ints[1], ints[2]
-    Wz, bz, Ww, _ = _places(ints, room)
-    for n in range(len(bz)):
+    nz, nw, nn, lanes = ints[0], ints[1], ints[2], ints[4]
+    for n in range(lanes):
         own = n < nn
-        bz[n] = weights[nn * nz + n] if own else 0.0
         for j in range(nz):
-            Wz[j, n] = weights[n * nz + j] if own else 0.0
-        for q in range(nw):
-            Ww[q, n] = weights[nn * (nz + 1 + q) + n] if own else 0.0
-
-
-@njit(nogil=True, inline="always")
-def _inside(Wz, bz, z, v):
-    """v = Wz z + bz."""
-    for n in range(len(v)):
-        v[n] = bz[n]
-    for j in range(len(Wz)):
-        for n in range(len(v)):
-            v[n] += Wz[j, n] * z[j]
+            room[j * lanes + n] = weights[n * nz + j] if own else 0.0
+        for q in range(nw + 1):  # bz is a row before Ww
+            room[(nz + q) * lanes + n] = weights[nn * (nz + q) + n] if own else 0.0
 
 
 def _value(ints, constants, weights, z, w, room):
-    Wz, bz, Ww, signals = _places(ints, room)
-    v, h, bw = signals[0], signals[1], ints[2] * (ints[0] + 1 + ints[1])
-    _inside(Wz, bz, z, v)
-    activate(ints[3], v, h)
-    for q in range(len(Ww)):
-        w[q] = weights[bw + q] + dot(Ww[q], h)
+    nz, nw, nn, lanes = ints[0], ints[1], ints[2], ints[4]
+    Ww, v, bw = (nz + 1) * lanes, (nz + 1 + nw) * lanes, nn * (nz + 1 + nw)
+    hidden(ints[3], nz, lanes, room, z, v)
+    for q in range(nw):
+        w[q] = weights[bw + q] + dot(room, Ww + q * lanes, room, v + lanes, lanes)
 
 
 def _slope(ints, constants, weights, z, J, by_weight, stride, room):
-    nz, nw, nn = ints[0], ints[1], ints[2]
-    Wz, bz, Ww, signals = _places(ints, room)
-    v, h, s = signals[0], signals[1], signals[2]
-    _inside(Wz, bz, z, v)
-    activate(ints[3], v, h)
-    slopes(ints[3], v, h, s)
-    by_bz, by_Ww, P = nn * nz, nn * (nz + 1), nn * (nz + 1 + nw) + nw
+    nz, nw, nn, lanes = ints[0], ints[1], ints[2], ints[4]
+    Ww, v, bw = (nz + 1) * lanes, (nz + 1 + nw) * lanes, nn * (nz + 1 + nw)
+    h, s = v + lanes, v + 2 * lanes
+    hidden(ints[3], nz, lanes, room, z, v)
     for q in range(nw):
         own = q * stride
-        for n in range(len(v)):
-            v[n] = Ww[q, n] * s[n]
+        by_bz, by_Ww = own + nn * nz, own + nn * (nz + 1)
+        for n in range(lanes):
+            room[v + n] = room[Ww + q * lanes + n] * room[s + n]
         for j in range(nz):
-            J[q * nz + j] = dot(Wz[j], v)
+            J[q * nz + j] = dot(room, j * lanes, room, v, lanes)
         if nz == 1:  # strides that are known become vector instructions
+            z0 = z[0]
             for n in range(nn):
-                by_weight[own + n] = v[n] * z[0]
+                by_weight[own + n] = room[v + n] * z0
+                by_weight[by_bz + n] = room[v + n]
         elif nz == 2:
+            z0, z1 = z[0], z[1]
             for n in range(nn):
-                by_weight[own + 2 * n] = v[n] * z[0]
-                by_weight[own + 2 * n + 1] = v[n] * z[1]
+                by_weight[own + 2 * n] = room[v + n] * z0
+                by_weight[own + 2 * n + 1] = room[v + n] * z1
+                by_weight[by_bz + n] = room[v + n]
         else:
             for n in range(nn):
                 for j in range(nz):
-                    by_weight[own + n * nz + j] = v[n] * z[j]
-        for n in range(nn):
-            by_weight[own + by_bz + n] = v[n]
-        for n in range(by_Ww, P):
-            by_weight[own + n] = 0.0
-        for n in range(nn):
-            by_weight[own + by_Ww + q * nn + n] = h[n]
-        by_weight[own + P - nw + q] = 1.0
+                    by_weight[own + n * nz + j] = room[v + n] * z[j]
+                by_weight[by_bz + n] = room[v + n]
+        for p in range(nw):
+            if p == q:
+                for n in range(nn):
+                    by_weight[by_Ww + p * nn + n] = room[h + n]
+            else:
+                for n in range(nn):
+                    by_weight[by_Ww + p * nn + n] = 0.0
+            by_weight[own + bw + p] = 1.0 if p == q else 0.0

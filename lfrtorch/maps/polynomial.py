@@ -169,9 +169,8 @@ def _value(ints, constants, weights, z, w, room):
     m[0] = 1.0
     for n in range(1, count):
         m[n] = m[ints[1 + 2 * n]] * z[ints[2 + 2 * n]]
-    C = carray(weights, (nw, count))
     for q in range(nw):
-        w[q] = dot(C[q], m)
+        w[q] = dot(weights, q * count, room, 0, count)
 
 
 def _slope(ints, constants, weights, z, J, by_weight, stride, room):
