@@ -28,6 +28,7 @@ from lfrtorch.least_squares.linear_systems import (
     QRAccumulator,
     SVDSystem,
     largest_eigenvalue,
+    product,
 )
 
 
@@ -84,7 +85,11 @@ class Eliminator:
         seen = _products(U.mT, rows)
         # Of B nothing is left, so that its columns may stay among the others.
         part = type(self._total)()
-        part.fold((rows - _products(U, seen)).flatten(0, 1))
+        if isinstance(part, GramAccumulator):  # a difference loses no more digits than products do
+            part.fold(rows.flatten(0, 1))
+            part.add(-product(seen.flatten(0, 1).mT, seen.flatten(0, 1)))
+        else:
+            part.fold((rows - _products(U, seen)).flatten(0, 1))
         place = torch.arange(columns, device=rows.device)
         kept = torch.cat([place[: columns - nx - 1], place[-1:]])
         self._total.add_columns(part, kept)
