@@ -175,7 +175,7 @@ def _visited(ends: Sequence[Tensor], paths: Sequence[Tensor]) -> bool:
             for part, own in zip(parts, trees, strict=True)
         ]
     )
-    near = [
-        np.min([tree.query(end.numpy() / deviation)[0] for tree in trees], axis=0) for end in ends
-    ]
-    return all(np.median(each) <= _NEAR * np.median(usual) for each in near)
+    points = np.concatenate([end.numpy() for end in ends]) / deviation
+    near = np.min([tree.query(points)[0] for tree in trees], axis=0)
+    each = np.split(near, np.cumsum([len(end) for end in ends])[:-1])
+    return all(np.median(own) <= _NEAR * np.median(usual) for own in each)
