@@ -184,7 +184,7 @@ def state_moments(model: Numbers, u: Float[Tensor, "R T nu"]) -> Float[Array, "R
     if not np.array_equal(P, np.eye(W.nx)):
         return np.broadcast_to(P, (len(u), W.nx, W.nx))
     x = to_float64(simulate(W, u, None).x)
-    lost = ~np.isfinite(x).all(axis=(1, 2))
+    lost: Booleans = np.asarray(~np.isfinite(x).all(axis=(1, 2)))
     x = np.where(lost[:, None, None], 0.0, x) if lost.any() else x
     return x.swapaxes(1, 2) @ x / x.shape[1]
 
@@ -249,8 +249,10 @@ def _fitted_by_torch(
         L, usable = _factor(W, u, weight, weight * (best.y - y), best)
         step, promised = np.zeros_like(x0), np.zeros(len(u))
         for r in np.flatnonzero(usable & np.isfinite(squares)):
-            own = (part[r] for part in prior)
-            step[r], promised[r], v[r] = step_of(L[r], squares[r], x0[r], *own, passes, seen[r])
+            white, spread, variance, counted = (part[r] for part in prior)
+            step[r], promised[r], v[r] = step_of(
+                L[r], squares[r], x0[r], white, spread, variance, counted, passes, seen[r]
+            )
         cost = before = costs(x0, squares)
         # A step that should hardly lower the cost is not worth a trial.
         waiting = promised > tolerance * cost  # False for NaN

@@ -64,8 +64,8 @@ class Snapshots:
     def least(self) -> float:
         """Least normalised squared error of all iterates; infinite if there is none."""
         files = [self._file(number) for number in range(self._count or 0)]
-        found = [state_file.read(file)[0]["best"] for file in files if file.is_file()]
-        return min(found, default=math.inf)
+        found = [state_file.read(file)[0]["at"] for file in files if file.is_file()]
+        return min((at["history"][at["chosen"]]["score"] for at in found), default=math.inf)
 
     def restore(self, fits: Sequence[Fit]) -> None:
         """Restore the fits that had begun; refuse other fits with a ValueError."""

@@ -7,9 +7,9 @@ same fit reads it again.
 from __future__ import annotations
 
 import json
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from torch import Tensor
 
@@ -17,11 +17,10 @@ from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.checkpoint import read_tensors, write_tensors
 from lfrtorch._support.errors import InputError, brief
 
-State = TypeVar("State")
 Tensors = dict[str, Tensor]
 Numbers = dict[str, Any]
 
-_FORMAT = "lfrtorch snapshot 3"
+_FORMAT = "lfrtorch snapshot 4"
 
 
 def write(path: Path, numbers: Numbers, tensors: Tensors) -> None:
@@ -47,48 +46,50 @@ def read(path: Path) -> tuple[Numbers, Tensors]:
     return json.loads(about["numbers"]), tensors
 
 
-def packed(state: Any) -> tuple[Numbers, Tensors]:
-    """Return numbers and texts of a dataclass, and tensors as state.name or state.name.key."""
-    numbers: Numbers = {}
-    tensors: Tensors = {}
-    for field in fields(state):
-        value = getattr(state, field.name)
-        if isinstance(value, Tensor | dict | tuple):
-            tensors |= leaves(value, f"state.{field.name}")
-        else:
-            numbers[field.name] = value
-    return numbers, tensors
+def packed(value: Any, name: str = "") -> tuple[Any, Tensors]:
+    """Return a value of dataclasses, tuples, dictionaries, numbers and texts, and its tensors.
 
-
-def leaves(value: Any, name: str) -> Tensors:
-    """Return the tensors in dictionaries and tuples, by name and key or place."""
+    Tensors have the names of the fields that lead to them, with dots, and are None in the value.
+    """
     if isinstance(value, Tensor):
-        return {name: value}
-    keyed = value.items() if isinstance(value, dict) else enumerate(value)
-    return {n: t for key, part in keyed for n, t in leaves(part, f"{name}.{key}").items()}
+        return None, {name: value}
+    if is_dataclass(value):
+        items = [(field.name, getattr(value, field.name)) for field in fields(value)]
+    elif isinstance(value, dict):
+        items = list(value.items())
+    elif isinstance(value, tuple):
+        items = list(enumerate(value))
+    else:
+        return value, {}
+    parts = {key: packed(part, _below(name, key)) for key, part in items}
+    tensors = {n: tensor for _, own in parts.values() for n, tensor in own.items()}
+    found = {key: part for key, (part, _) in parts.items()}
+    return list(found.values()) if isinstance(value, tuple) else found, tensors
 
 
-def refilled(like: Any, name: str, tensors: Tensors) -> Any:
-    """Return what ``leaves`` took apart; tuples are as many and of the kinds that ``like`` has."""
-    if isinstance(like, Tensor):
+def unpacked(like: Any, value: Any, tensors: Tensors, name: str = "") -> Any:
+    """Return what was packed, of the kinds that ``like`` has; of a longer tuple those of its last.
+
+    Raises:
+        TypeError, KeyError: it was of other kinds.
+    """
+    if name in tensors:
         return tensors[name]
+
+    def part(key: Any, kind: Any) -> Any:
+        return unpacked(kind, value[key], tensors, _below(name, key))
+
+    if is_dataclass(like):
+        names = [field.name for field in fields(like)]
+        return replace(like, **{n: part(n, getattr(like, n)) for n in names})  # pyright: ignore[reportArgumentType]
     if isinstance(like, dict):
-        return within(f"{name}.", tensors)
-    parts = [refilled(part, f"{name}.{i}", tensors) for i, part in enumerate(like)]
-    return type(like)(*parts) if hasattr(like, "_fields") else tuple(parts)
+        return {key: part(key, like.get(key)) for key in value}
+    if isinstance(like, tuple):
+        kinds = [like[min(i, len(like) - 1)] if like else None for i in range(len(value))]
+        parts = [part(i, kind) for i, kind in enumerate(kinds)]
+        return type(like)(*parts) if hasattr(like, "_fields") else tuple(parts)
+    return value
 
 
-def unpacked(like: State, numbers: Numbers, tensors: Tensors) -> State:
-    """Return a dataclass like the given one with the fields that were packed."""
-    values: Numbers = dict(numbers)
-    for field in fields(like):  # pyright: ignore[reportArgumentType]
-        value = getattr(like, field.name)
-        if isinstance(value, Tensor | dict | tuple):
-            values[field.name] = refilled(value, f"state.{field.name}", tensors)
-    return replace(like, **values)  # pyright: ignore[reportArgumentType]
-
-
-def within(prefix: str, tensors: Tensors) -> Tensors:
-    """Return the tensors whose names begin with a prefix, under the rest of their names."""
-    found = (name for name in tensors if name.startswith(prefix))
-    return {name.removeprefix(prefix): tensors[name] for name in found}
+def _below(name: str, key: object) -> str:
+    return f"{name}.{key}" if name else str(key)

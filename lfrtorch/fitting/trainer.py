@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -20,6 +20,7 @@ from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting import state_file
 from lfrtorch.fitting.exclusions import refuse_together
+from lfrtorch.fitting.fit_state import FitState, Progress
 from lfrtorch.fitting.windows import windows
 from lfrtorch.least_squares.guarantee import Name
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, Point
@@ -30,9 +31,6 @@ from lfrtorch.records import Record, as_records
 
 EXPLOSION = 100.0
 """Growth of the squared validation error, beyond the start's, in a step that is taken back."""
-
-_KEPT = ("best", "_chosen", "_first", "_score", "_seconds", "_durations")
-"""Numbers of a fit that are saved with it."""
 
 
 class StartDivergesError(InputError):
@@ -71,37 +69,6 @@ class Trainer(Protocol):
     def prolonged(self, state: Any) -> Any:
         """State to go on from if all iterations were spent and more are allowed now."""
         ...
-
-
-@dataclass(frozen=True)
-class Progress:
-    """One line of the history.
-
-    Args:
-        iteration: 0 is the start.
-        limit: most iterations.
-        train, validation: root mean squared simulation errors, output unit (normalised if outputs
-            have several); validation is NaN if there is no validation record or the model diverges
-            on it.
-        seconds: since the start of the fit.
-        best: whether this iterate is the best so far, on validation if there is one.
-        report: scalars of the trainer.
-        score: normalised squared error that chooses: on validation, or on training without it.
-    """
-
-    iteration: int
-    limit: int
-    train: float
-    validation: float
-    seconds: float
-    best: bool
-    report: dict[str, float]
-    score: float
-
-    @property
-    def seconds_left(self) -> float:
-        """Time that the remaining iterations would take."""
-        return self.seconds / max(1, self.iteration) * (self.limit - self.iteration)
 
 
 Monitor = Callable[[Model, Progress], None]
@@ -251,31 +218,39 @@ class Fit:
                 ranks=ranks,
             )
         self.judge = self.judge_of(model, validation) if validation else None
-        self._judged: Point | None = None  # the latest iterate, as the judge sees it
-        self.state: Any = None
-        """The trainer's; None before the first call of ``advance``."""
-        self.history: list[Progress] = []
+        self.at: FitState | None = None
+        """Where it stands; None before the first call of ``advance``."""
         self.note_end(Reason.NO_ITERATIONS)
-        self.best = math.inf
-        """Normalised squared error of the best iterate, on validation if there is one."""
-        self._theta_best, self._chosen = self.problem.theta, 0
-        self._first = self._score = math.inf
-        self._seconds = 0.0
-        self._durations: list[float] = []
-        if not math.isfinite(self.problem.evaluate(self.problem.theta).cost):
+        theta = self.problem.theta
+        if not math.isfinite(self.problem.evaluate(theta).cost):
             self.note_end(Reason.START_DIVERGES)
-            self.history.append(
-                Progress(0, self.trainer.limit, math.inf, math.nan, 0.0, False, {}, math.inf)
-            )
+            limit = self.trainer.limit
+            lost = Progress(0, limit, math.inf, math.nan, 0.0, False, {}, math.inf)
+            self.at = FitState(None, (), theta, (lost,))
 
     def judge_of(self, model: Model, records: Record | Sequence[Record]) -> Problem:
         """Return the problem of a model's errors on records that are not fitted."""
         return Problem.judge(model, records, like=self.problem)
 
     @property
+    def state(self) -> Any:
+        """The trainer's state; None before the first call of ``advance``."""
+        return None if self.at is None else self.at.search
+
+    @property
+    def history(self) -> tuple[Progress, ...]:
+        """One entry an iterate, the start first; none before the first call of ``advance``."""
+        return () if self.at is None else self.at.history
+
+    @property
+    def best(self) -> float:
+        """Normalised squared error of the best iterate, on validation if there is one."""
+        return math.inf if self.at is None else self.at.kept.score
+
+    @property
     def seconds(self) -> float:
         """Time of all iterations, those before it went on included."""
-        return self._seconds
+        return 0.0 if self.at is None else self.at.history[-1].seconds
 
     @property
     def diverges(self) -> bool:
@@ -285,12 +260,13 @@ class Fit:
     @property
     def kept(self) -> Progress:
         """The best iterate."""
-        return self.history[self._chosen]
+        assert self.at is not None
+        return self.at.kept
 
     @property
     def over(self) -> bool:
         """Whether there is no more to come."""
-        if not self.history or self.diverges:
+        if self.at is None or self.diverges:
             return self.diverges
         return bool(self.state.reason) or self.state.iteration >= self.trainer.limit
 
@@ -334,39 +310,31 @@ class Fit:
 
     def pause(self) -> None:
         """Put the best iterate into the model, and let go of memory."""
-        self.problem.write(self._theta_best)
+        self._write_best()
         self.problem.release()
         if not self.diverges:
             self.keep(self, True)
 
     def save(self, path: Path) -> None:
         """Write the state of the fit to a file, from which ``restore`` goes on to the same bits."""
-        state, tensors = state_file.packed(self.state)
-        problem = self.problem.state_dict()
-        tensors |= {f"problem.{name}": tensor for name, tensor in problem.items()}
-        if self._judged is not None:
-            tensors |= state_file.leaves(self._judged.seen, "judged")
-        numbers = {
-            "state": state,
-            "history": [asdict(progress) for progress in self.history],
-            **{name: getattr(self, name) for name in _KEPT},
-        }
-        state_file.write(path, numbers, tensors | {"best": self._theta_best})
+        whole = {"at": self.at, "problem": self.problem.state_dict()}
+        state_file.write(path, *state_file.packed(whole))
 
     def restore(self, path: Path) -> None:
         """Take over the state of a fit of the same model, records and trainer."""
-        numbers, tensors = state_file.read(path)
-        device = self.problem.theta.device
-        like = self.trainer.init(self.problem, self.problem.theta)
-        tensors = {name: tensor.to(device) for name, tensor in tensors.items()}
-        self.problem.load_state_dict(state_file.within("problem.", tensors))
+        found, tensors = state_file.read(path)
+        tensors = {name: tensor.to(self.problem.theta.device) for name, tensor in tensors.items()}
+        like: dict[str, Any] = {"at": self._begun(), "problem": {}}
         try:
-            state = state_file.unpacked(like, numbers["state"], tensors)
+            whole = state_file.unpacked(like, found, tensors)
         except (TypeError, KeyError):
             raise InputError(
                 f"'{path}' was left by another trainer than {type(self.trainer).__name__}; go "
                 "on with the one that the run had."
             ) from None
+        self.problem.load_state_dict(whole["problem"])
+        at: FitState = whole["at"]
+        state = at.search
         if state.iteration > self.trainer.limit:
             raise InputError(
                 f"the fit that is to go on has had {state.iteration} iterations, more than the "
@@ -375,86 +343,78 @@ class Fit:
         if self.ranks.world > 1:  # what was kept is the first process's part
             point = self.problem.evaluate(state.theta)
             state = replace(state, residual=point.residual, seen=point.seen)
-        if self.judge is not None:
-            own = self.problem.errors.parameters.own
-            self._judged = self.judge.evaluate(state.theta[:own])
-            seen = state_file.refilled(self._judged.seen, "judged", tensors)
-            self._judged = self._judged._replace(seen=seen)
-        self.state = self.trainer.prolonged(state)
+        self.at = replace(at, search=self.trainer.prolonged(state))
         self.reason = self.state.reason
-        self.history = [Progress(**entry) for entry in numbers["history"]]
-        self._theta_best = tensors["best"]
-        for name in _KEPT:
-            setattr(self, name, numbers[name])
-        self.problem.write(self._theta_best)
+        self._write_best()
 
     def begin(self, monitors: Sequence[Monitor] = ()) -> None:
         """Judge the start."""
+        self.at = self._begun()
+        self._show(self.state.theta, self.at.history[0], monitors)
+
+    def _begun(self) -> FitState:
+        """State at the start."""
         clock = time.perf_counter()
         start = self.trainer.init(self.problem, self.problem.theta)
-        progress = self._progress(start, time.perf_counter() - clock)
-        self._first = progress.score
-        self._enter(start, progress)
-        self._show(start.theta, progress, monitors)
+        at = FitState(start, (), start.theta, ())
+        return self._entered(at, start, time.perf_counter() - clock)
 
     def take(self, after: Any, seconds: float, monitors: Sequence[Monitor] = ()) -> None:
         """Go on from the trainer's next state, which took ``seconds`` to find."""
         # If the model there explodes on validation, the search goes back and takes smaller steps.
-        before, last = self.state, self._score
-        progress = self._progress(after, seconds)
+        assert self.at is not None
+        before, last, first = self.state, self.at.score, self.at.history[0].score
+        at = self._entered(self.at, after, seconds)
         if after.theta is not before.theta:
-            self._durations.append(seconds)
-        self._enter(after, progress)
-        self.reason = after.reason
-        if math.isfinite(last) and not progress.score <= max(EXPLOSION * last, self._first):
-            self.state, self._score = self.trainer.refused(before, after), last
-        self._show(after.theta, progress, monitors)
+            at = replace(at, durations=(*at.durations, seconds))
+        if math.isfinite(last) and not at.score <= max(EXPLOSION * last, first):
+            at = replace(at, search=self.trainer.refused(before, after), score=last)
+        self.at, self.reason = at, after.reason
+        self._show(after.theta, at.history[-1], monitors)
         self.keep(self, False)
 
     def show_last(self, monitors: Sequence[Monitor]) -> None:
         """Call monitors with the latest iterate; the best is in the model again after that."""
         self._show(self.state.theta, self.history[-1], monitors)
-        self.problem.write(self._theta_best)
+        self._write_best()
 
     def result(self) -> FitResult:
         """What was found."""
-        usual = self._durations[1:] or self._durations
+        assert self.at is not None
+        usual = self.at.durations[1:] or self.at.durations
         return FitResult(
             model=self.model,
-            history=self.history,
-            chosen_iteration=self._chosen,
-            seconds=self._seconds,
+            history=list(self.at.history),
+            chosen_iteration=self.at.chosen,
+            seconds=self.seconds,
             seconds_per_iteration=float(np.median(usual)) if usual else 0.0,
             reason=self.reason,
             detail=self.detail,
         )
 
-    def _progress(self, state: Any, seconds: float) -> Progress:
-        """The errors of an iterate, as a line of the history; it took ``seconds`` to find."""
+    def _entered(self, at: FitState, search: Any, seconds: float) -> FitState:
+        """State after another iterate, which took ``seconds`` to find, with its errors."""
         clock, problem = time.perf_counter(), self.problem
-        train_rmse, validation_rmse = problem.rmse_at(state.point), float("nan")
-        score = state.point.cost
+        train_rmse, validation_rmse = problem.rmse_at(search.point), float("nan")
+        score, judged = search.point.cost, ()
         if self.judge is not None:
-            theta = state.theta[: problem.errors.parameters.own]  # the judge finds initial states
-            self._judged = self.judge.evaluate(theta, self._judged)  # every output counts alike
+            theta = search.theta[: problem.errors.parameters.own]  # the judge finds initial states
+            near = Point(theta, theta, 0.0, at.judged) if at.judged else None
+            point = self.judge.evaluate(theta, near)  # every output counts alike
             # Each process has all of these records, and its own rounding errors.
-            score = torch.tensor(self._judged.cost, dtype=torch.float64)
-            score = float(self.ranks.first(score))
-            validation_rmse = self.judge.rmse_at(self._judged)
-        better = score < self.best  # False for the NaN of a model that diverges on validation
-        seconds += self._seconds + time.perf_counter() - clock
-        return Progress(
-            state.iteration, self.trainer.limit, train_rmse, validation_rmse, seconds, better,
-            state.report, score,
+            score = float(self.ranks.first(torch.tensor(point.cost, dtype=torch.float64)))
+            validation_rmse, judged = self.judge.rmse_at(point), point.seen
+        better = score < (at.kept.score if at.history else math.inf)  # False for NaN
+        seconds += (at.history[-1].seconds if at.history else 0.0) + time.perf_counter() - clock
+        progress = Progress(
+            search.iteration, self.trainer.limit, train_rmse, validation_rmse, seconds, better,
+            search.report, score,
         )  # fmt: skip
+        return at.entered(search, judged, progress)
 
-    def _enter(self, state: Any, progress: Progress) -> None:
-        """Note an iterate, and keep it if it is the best."""
-        if progress.best:
-            self._theta_best, self.best = state.theta, progress.score
-            self._chosen = len(self.history)
-        self.state, self._score, self._seconds = state, progress.score, progress.seconds
-        self.history.append(progress)
+    def _write_best(self) -> None:
+        """Put the best iterate into the model."""
+        self.problem.write(self.problem.theta if self.at is None else self.at.best)
 
     def _show(self, theta: Tensor, progress: Progress, monitors: Sequence[Monitor]) -> None:
         """Call the monitors, with the iterate in the model."""

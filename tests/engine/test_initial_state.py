@@ -1,6 +1,6 @@
 """Initial states that are estimated from the output: known ones, hidden ones, faded ones."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -45,7 +45,8 @@ def test_machine_code_and_torch_find_the_same_initial_states(sizes, noise: float
     y = y + noise * normal(5, 40, ny, seed=2)
     weight = torch.ones_like(y)
     weight[:, 12:] = 0.0
-    ways = [estimated_start, start_from_beginning, lambda *given: estimated_start(*given, near)]
+    ways: list[Callable[..., Tensor]] = [estimated_start, start_from_beginning]
+    ways.append(lambda cell, u, y, weight: estimated_start(cell, u, y, weight, near))
     near = normal(5, nx, seed=1)
     found = [way(cell, u, y, weight) for way in ways]
     monkeypatch.setattr(threads, "COMPILED_ON", set())

@@ -4,7 +4,7 @@ import copy
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -100,10 +100,8 @@ def run(
 
 def stand(fit: Fit) -> dict[str, Any]:
     """All that the next steps of a fit depend on, and all that its result is made of."""
-    found = {field.name: getattr(fit.state, field.name) for field in fields(fit.state)}
-    found |= {name: getattr(fit, name) for name in trainer._KEPT}
-    found |= {"history": [asdict(p) for p in fit.history], "theta_best": fit._theta_best}
-    return copy.deepcopy(found | {"problem": fit.problem.state_dict()})
+    found, tensors = state_file.packed(fit.at)
+    return copy.deepcopy({"at": found, **tensors, "problem": fit.problem.state_dict()})
 
 
 def same(one: Any, other: Any) -> bool:
@@ -256,7 +254,8 @@ def test_a_step_that_was_taken_back_is_taken_back_again(tmp_path, monkeypatch):
     optimiser, refusals = LevenbergMarquardt(max_iter=12), []
 
     def keep(fit: Fit, paused: bool) -> None:
-        if not paused and fit.history[-1].score != fit._score:
+        assert fit.at is not None
+        if not paused and fit.history[-1].score != fit.at.score:
             refusals.append(tmp_path / str(fit.state.iteration))
             fit.save(refusals[-1])
 

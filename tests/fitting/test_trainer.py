@@ -414,8 +414,9 @@ def test_time_left_is_that_of_the_iterations_so_far():
 
 def test_usual_duration_is_the_median_without_the_first():
     begun = Fit(*planted(T=20)[:2], trainer=LevenbergMarquardt(max_iter=1)).advance()
-    for durations, usual in (([9.0, 1.0, 4.0, 2.0], 2.0), ([9.0], 9.0)):
-        begun._durations = durations
+    for durations, usual in (((9.0, 1.0, 4.0, 2.0), 2.0), ((9.0,), 9.0)):
+        assert begun.at is not None
+        begun.at = replace(begun.at, durations=durations)
         assert begun.result().seconds_per_iteration == usual
 
 
