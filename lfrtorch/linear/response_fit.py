@@ -10,6 +10,8 @@ poles that the lines do not tell are limited by ``pole_limits``.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -19,7 +21,7 @@ from torch import Tensor
 
 from lfrtorch._support.types import Array, Booleans, Complex
 from lfrtorch.least_squares.gauge import Reduction, reduction
-from lfrtorch.least_squares.levenberg_marquardt import LeastSquares
+from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, Point
 from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.linear.modal_jacobian import ModalJacobian, Modes, stacked, with_best_inputs
 from lfrtorch.linear.model import linear_cell
@@ -193,8 +195,6 @@ class ResponseProblem(LeastSquares):
         self._fixed = fixed if fixed.any() else None
         self._by_modes = by_modes
         self._limits = limits
-        self._latest: tuple[Tensor, Complex] | None = None
-        self._latest_modes: tuple[Tensor, Modes | None] | None = None
         self._reduced: Reduction | None = None
 
     def matrices(self, theta: Tensor) -> list[Array]:
@@ -203,29 +203,39 @@ class ResponseProblem(LeastSquares):
         ends = np.cumsum([rows * columns for rows, columns in self.shapes])
         return [p.reshape(s) for p, s in zip(np.split(parts, ends[:-1]), self.shapes, strict=True)]
 
-    def residual(self, theta: Tensor) -> Tensor:
+    def evaluate(self, theta: Tensor, near: Point | None = None) -> Point:
         """Weighted G U - Y, real parts then imaginary parts, then ρ e, (2 F ny m + nx,)."""
-        poles = self._poles(theta)
-        if not np.abs(poles).max() < self.largest_pole:
-            size = 2 * self.data.Y.size + len(poles)
-            return torch.full((size,), torch.inf, dtype=torch.float64)
-        errors = self.errors(theta)
-        if self._limits is None:
-            return stacked(errors, np.zeros(len(poles)))
-        e, _ = self._limits.excess(poles)
-        return stacked(errors, math.sqrt(PART) * np.linalg.norm(errors) * e)
+        at = self._at(theta)
+        if at.errors is None:
+            size = 2 * self.data.Y.size + len(at.poles)
+            residual = torch.full((size,), torch.inf, dtype=torch.float64)
+        elif self._limits is None:
+            residual = stacked(at.errors, np.zeros(len(at.poles)))
+        else:
+            e, _ = self._limits.excess(at.poles)
+            residual = stacked(at.errors, math.sqrt(PART) * np.linalg.norm(at.errors) * e)
+        return Point(theta, residual, float(residual.square().sum()), (at,))
 
-    def cost(self, residual: Tensor) -> float:
-        """|r|²."""
-        return float(residual.square().sum())
+    def residual(self, theta: Tensor) -> Tensor:
+        """The same, of a θ alone."""
+        return self.evaluate(theta).residual
+
+    def linearise_at(self, point: Point) -> ResponseJacobian | ModalJacobian:
+        """Return the Jacobian, without the columns of a change of state coordinates."""
+        at: _At = point.seen[0]
+        assert at.errors is not None
+        excess = self._excess(at, len(point.theta))
+        if at.modes is not None:
+            return ModalJacobian(at.modes, self.data, at.errors, free=self._free, excess=excess)
+        return ResponseJacobian(*self._jacobian(at), at.errors, excess)
 
     def linearise(self, theta: Tensor) -> ResponseJacobian | ModalJacobian:
-        """Return the Jacobian, without the columns of a change of state coordinates."""
-        modes, excess = self._modes(theta), self._excess(theta)
-        if modes is not None:
-            errors = self.errors(theta)
-            return ModalJacobian(modes, self.data, errors, free=self._free, excess=excess)
-        return ResponseJacobian(*self._jacobian(theta), self.errors(theta), excess)
+        """The same, of a θ alone."""
+        return self.linearise_at(self.evaluate(theta))
+
+    def errors(self, theta: Tensor) -> Complex:
+        """Weighted G U - Y (F, ny, m)."""
+        return self._errors(self._at(theta))
 
     def covariance(self, theta: Tensor, known: bool) -> Array:
         """Return the covariance (P, P) of θ at the minimum.
@@ -233,69 +243,76 @@ class ResponseProblem(LeastSquares):
         Unless the weights are ``known`` to be inverse variances, the error found at each line
         stands for its variance (White's estimate).
         """
-        errors, nx = self.errors(theta), self.shapes[0][0]
+        at, nx = self._at(theta), self.shapes[0][0]
         none = np.zeros(nx), np.zeros((nx, len(theta)))
-        jacobian = ResponseJacobian(*self._jacobian(theta), errors, none)
+        jacobian = ResponseJacobian(*self._jacobian(at), self._errors(at), none)
         return jacobian.covariance(self.data, known=known)
 
-    def _jacobian(self, theta: Tensor) -> tuple[Complex, Reduction]:
+    def _at(self, theta: Tensor) -> _At:
+        """The model at θ."""
+        matrices = self.matrices(theta)
+        modes = Modes.of(*matrices) if self._by_modes else None
+        poles = np.linalg.eigvals(matrices[0]) if modes is None else modes.poles
+        at = _At(matrices, np.asarray(poles, dtype=np.complex128), modes)
+        if not np.abs(poles).max() < self.largest_pole:
+            return at
+        if modes is None:
+            at = at._replace(states=self._states(matrices))
+        return at._replace(errors=self._errors(at))
+
+    def _errors(self, at: _At) -> Complex:
+        if at.errors is not None:
+            return at.errors
+        U = self.data.U
+        if at.modes is not None:
+            return self.data.weighted(at.modes.response(self.data.z) @ U - self.data.Y)
+        _, _, C, D = at.matrices
+        X = self._states(at.matrices) if at.states is None else at.states
+        response = C @ X + D @ U if self._together else (C @ X + D) @ U
+        return self.data.weighted(response - self.data.Y)
+
+    def _states(self, matrices: Sequence[Array]) -> Complex:
+        """Return (zI - A)⁻¹ B, times U if ``together``."""
+        A, B, _, _ = matrices
+        z = self.data.z
+        return solve_driven(A, B, z, self.data.U) if self._together else solve_resolvent(A, B, z)
+
+    def _jacobian(self, at: _At) -> tuple[Complex, Reduction]:
         """Weighted derivative of G U in the columns that are kept, and how these give all."""
-        cell = linear_cell(*self.matrices(theta))
-        initial_states = torch.zeros(0, len(cell.A), dtype=torch.float64)
+        A, _, C, _ = at.matrices
+        initial_states = torch.zeros(0, len(A), dtype=torch.float64)
+        cell = linear_cell(*at.matrices)
         self._reduced = reduction(cell, initial_states, before=self._reduced, fixed=self._fixed)
-        A, _, C, _ = self.matrices(theta)
-        U, X, L = self.data.U, self._states(theta), solve_left(A, C, self.data.z)
+        X = self._states(at.matrices) if at.states is None else at.states
+        U, L = self.data.U, solve_left(A, C, self.data.z)
         J = response_jacobian(X if self._together else X @ U, L, U, self._reduced.kept.numpy())
         return self.data.weighted(J), self._reduced
 
-    def _excess(self, theta: Tensor) -> tuple[Array, Array]:
+    def _excess(self, at: _At, parameters: int) -> tuple[Array, Array]:
         """Excess (nx,) of each pole over its limit, and its derivative (nx, P) with θ."""
-        poles = self._poles(theta)
-        e, slopes = np.zeros(len(poles)), np.zeros((len(poles), len(theta)))
+        poles = at.poles
+        e, slopes = np.zeros(len(poles)), np.zeros((len(poles), parameters))
         if self._limits is not None:
             e, _ = self._limits.excess(poles)
             if e.any():
-                modes = self._modes(theta)
-                if modes is not None:
-                    poles, V, W = modes[:3]
+                if at.modes is not None:
+                    poles, V, W = at.modes[:3]
                 else:
-                    eigen = np.linalg.eig(self.matrices(theta)[0])
+                    eigen = np.linalg.eig(at.matrices[0])
                     poles, V = (np.asarray(part, dtype=np.complex128) for part in eigen)
                     W = np.asarray(np.linalg.pinv(V), dtype=np.complex128)
                 slopes[:, : V.size] = self._limits.slopes(poles, V, W)
         return e, slopes
 
-    def _poles(self, theta: Tensor) -> Complex:
-        modes = self._modes(theta)
-        poles = np.linalg.eigvals(self.matrices(theta)[0]) if modes is None else modes.poles
-        return np.asarray(poles, dtype=np.complex128)
 
-    def errors(self, theta: Tensor) -> Complex:
-        """Weighted G U - Y (F, ny, m)."""
-        modes, U = self._modes(theta), self.data.U
-        if modes is not None:
-            return self.data.weighted(modes.response(self.data.z) @ U - self.data.Y)
-        _, _, C, D = self.matrices(theta)
-        X = self._states(theta)
-        response = C @ X + D @ U if self._together else (C @ X + D) @ U
-        return self.data.weighted(response - self.data.Y)
+class _At(NamedTuple):
+    """A linear model at one θ."""
 
-    def _modes(self, theta: Tensor) -> Modes | None:
-        """Return the modes of θ, if derivatives are computed by them; the latest are cached."""
-        if not self._by_modes:
-            return None
-        if self._latest_modes is None or not torch.equal(self._latest_modes[0], theta):
-            self._latest_modes = theta.clone(), Modes.of(*self.matrices(theta))
-        return self._latest_modes[1]
-
-    def _states(self, theta: Tensor) -> Complex:
-        """Return (zI - A)⁻¹ B, times U if ``together``; the one of the latest θ is cached."""
-        if self._latest is None or not torch.equal(self._latest[0], theta):
-            A, B, _, _ = self.matrices(theta)
-            z = self.data.z
-            X = solve_driven(A, B, z, self.data.U) if self._together else solve_resolvent(A, B, z)
-            self._latest = theta.clone(), X
-        return self._latest[1]
+    matrices: list[Array]
+    poles: Complex128[Complex, " nx"]
+    modes: Modes | None  # if derivatives are computed by them
+    states: Complex | None = None  # (zI - A)⁻¹ B, times U if the problem has them together
+    errors: Complex128[Complex, "F ny m"] | None = None  # None if a pole passes the limit
 
 
 class ResponseJacobian:
