@@ -193,7 +193,7 @@ def of_circuit(seed: int) -> Iterator[tuple[str, float, float]]:
 
     yield "linear", errors(linear)[0], errors(ahead)[1]
     kinds: tuple[tuple[Noise, lfrtorch.LinearModel], ...]
-    kinds = ("output", linear), ("innovation", ahead), ("both", ahead)
+    kinds = ("output", linear), ("innovation", ahead)
     for noise, begin in kinds:
         starts = [lfrtorch.initialise(begin, train, nz=1, nw=1, nn=10, seed=s) for s in range(4)]
         result = lfrtorch.fit(

@@ -20,7 +20,6 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from copy import deepcopy
 
 import torch
@@ -49,28 +48,14 @@ def split_predictor(cell: LFRCell) -> tuple[LFRCell, Float[Tensor, "nx ny"]]:
     """The cell of a predictor's system, and its innovation gain K."""
     with torch.no_grad():
         found = _like(cell, cell.nu - cell.ny)
-        weights, K = split_weights(dict(cell.named_parameters()))
-        for name, parameter in found.named_parameters():
-            parameter.copy_(weights[name])
+        K = cell.Bu[:, found.nu :].clone()
+        found.A.copy_(cell.A + K @ cell.Cy)
+        found.Bu.copy_(cell.Bu[:, : found.nu] + K @ cell.Dyu[:, : found.nu])
+        found.Bw.copy_(cell.Bw + K @ cell.Dyw)
+        for name in ("Dzu", "Dyu"):
+            getattr(found, name).copy_(getattr(cell, name)[:, : found.nu])
     found.free_feedthrough(z=cell.Dzu.requires_grad, y=cell.Dyu.requires_grad)
     return found, K
-
-
-def split_weights(
-    weights: Mapping[str, Tensor],
-) -> tuple[dict[str, Tensor], Float[Tensor, "*axes nx ny"]]:
-    """The same for parameters by name, which may have leading axes."""
-    nu = weights["Bu"].shape[-1] - weights["Cy"].shape[-2]
-    Bu, K = weights["Bu"][..., :nu], weights["Bu"][..., nu:].clone()
-    Dyu = weights["Dyu"][..., :nu]
-    changed = {
-        "A": weights["A"] + K @ weights["Cy"],
-        "Bu": Bu + K @ Dyu,
-        "Bw": weights["Bw"] + K @ weights["Dyw"],
-        "Dyu": Dyu,
-        "Dzu": weights["Dzu"][..., :nu],
-    }
-    return {**weights, **changed}, K
 
 
 def _like(cell: LFRCell, nu: int) -> LFRCell:

@@ -46,7 +46,6 @@ from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.over_processes import OverProcesses, same_weights
 from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.fitting.prediction import (
-    SIMULATION,
     predicting,
     shown_innovation_form,
     without_gain,
@@ -132,9 +131,8 @@ def fit(
         noise: where it acts. ``"output"``: on the outputs, and the simulation error is minimised.
             ``"innovation"``: inside the system, too, and the error of the prediction one sample
             ahead is minimised; all errors are those of predictions, and the model of the result
-            has K. ``"both"``: the simulation error is minimised as well, with three times the
-            weight, which keeps the model from running away. The models need a K, as ``initialise``
-            writes it from a linear model of ``estimate_bla(..., refine="prediction")``.
+            has K. The models need a K, as ``initialise`` writes it from a linear model of
+            ``estimate_bla(..., refine="prediction")``.
         horizon: samples of the windows that training records are cut into, each simulated from a
             start state that is fitted with the parameters (``lfrtorch.fitting.windows``). Errors
             are then those in windows. Windows of records with a measured start begin at outputs.
@@ -191,7 +189,6 @@ def fit(
         "horizon": horizon,
         "ranks": Ranks() if ranks is None else ranks,
         "stop": stop,
-        "simulation": SIMULATION.get(noise, 0.0),
     }
     found = partial(_fitted, average=average, watch=watch, snapshots=snapshots, options=options)
     models = models if isinstance(models, Model) else _different(models)
@@ -438,8 +435,7 @@ class _Judge:
 
     def _error(self, model: Model) -> Problem:
         """Return the same error for starts and means."""
-        one = next(fit for fit in self._fits if not fit.diverges)
-        return one.judge_of(model, self._records)
+        return Problem.judge(model, self._records)
 
     def _score(self, fit: Fit) -> float:
         if not math.isfinite(fit.best) or not self._records:

@@ -14,7 +14,7 @@ from lfrtorch._support.settings import setting
 Size = int | Literal["auto"]
 """A number, or one that the data choose."""
 
-Noise = Literal["output", "innovation", "both"]
+Noise = Literal["output", "innovation"]
 """What is fitted: simulations, as if noise were at the outputs alone, predictions, or both."""
 
 
@@ -76,7 +76,7 @@ class PlainSettings:
     )
     noise: Noise = setting(
         "output",
-        'where it acts, ``"output"`` or ``"innovation"``, or ``"both"``, see :func:`lfrtorch.fit`. '
+        'where it acts, ``"output"`` or ``"innovation"``, see :func:`lfrtorch.fit`. '
         'If it is not the output, the linear model has ``refine="prediction"``, too, and '
         "validation errors are those of predictions one sample ahead.",
     )

@@ -12,9 +12,6 @@ from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, with_past_outputs
 
-SIMULATION: dict[str, float] = {"innovation": 0.0, "both": 3.0}
-"""Weight of simulation errors beside those of predictions, if both were as large at the start."""
-
 
 def without_gain(models: Model | Sequence[Model]) -> Model | list[Model]:
     """Models whose simulation is fitted: K would be that of the models before the fit."""

@@ -185,7 +185,6 @@ class Fit:
         *,
         trainer: Trainer | None = None,
         ridge: Ridge = 0.0,
-        simulation: float = 0.0,
         horizon: int | None = None,
         ranks: Ranks | None = None,
         keep: Keep = lambda fit, paused: None,
@@ -206,18 +205,10 @@ class Fit:
             train = cut(as_records(train))
             if validation:
                 validation = cut(as_records(validation), fitted=False)
-        if simulation:
-            self.problem = Problem.of_predictor(model, train, simulation, ridge=ridge, ranks=ranks)
-        else:
-            self.problem = Problem.of(
-                model,
-                train,
-                ridge=ridge,
-                guarantee=guarantee,
-                longest=longest,
-                ranks=ranks,
-            )
-        self.judge = self.judge_of(model, validation) if validation else None
+        self.problem = Problem.of(
+            model, train, ridge=ridge, guarantee=guarantee, longest=longest, ranks=ranks
+        )
+        self.judge = Problem.judge(model, validation) if validation else None
         self.at: FitState | None = None
         """Where it stands; None before the first call of ``advance``."""
         self.note_end(Reason.NO_ITERATIONS)
@@ -227,10 +218,6 @@ class Fit:
             limit = self.trainer.limit
             lost = Progress(0, limit, math.inf, math.nan, 0.0, False, {}, math.inf)
             self.at = FitState(None, (), theta, (lost,))
-
-    def judge_of(self, model: Model, records: Record | Sequence[Record]) -> Problem:
-        """Return the problem of a model's errors on records that are not fitted."""
-        return Problem.judge(model, records, like=self.problem)
 
     @property
     def state(self) -> Any:

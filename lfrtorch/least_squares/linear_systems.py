@@ -209,10 +209,6 @@ class QRAccumulator:
         wide[:, place] = R
         self.fold(wide)
 
-    def absorb_mapped(self, other: Any, change: Float[Tensor, "m n"]) -> None:
-        """Add the rows of another times a matrix."""
-        self.fold(other.R @ change)
-
     def add_columns(self, other: Any, kept: Int[Tensor, " n"]) -> None:
         """Add some columns of the rows of another."""
         self.fold(other.R[:, kept])
@@ -259,10 +255,6 @@ class GramAccumulator:
             self._parts = [other.G.new_zeros(width, width)]
         G = other.G if tie is None else tied(tied(other.G, tie).mT, tie)
         self._parts[0][place.unsqueeze(1), place] += G
-
-    def absorb_mapped(self, other: Any, change: Float[Tensor, "m n"]) -> None:
-        """Add the rows of another times a matrix."""
-        self.add(change.mT @ other.G @ change)
 
     def add_columns(self, other: Any, kept: Int[Tensor, " n"]) -> None:
         """Add some columns of the rows of another."""

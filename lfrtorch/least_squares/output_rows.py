@@ -18,7 +18,6 @@ from torch import Tensor
 
 from lfrtorch._support.threads import spread
 from lfrtorch.engine.sensitivity import Linearisation, Rows, fixed_point, output_jacobian
-from lfrtorch.least_squares.gauge import everything
 from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator
 from lfrtorch.least_squares.output_columns import OutputColumns
 from lfrtorch.least_squares.record_groups import RecordGroup
@@ -253,48 +252,6 @@ class OutputRows:
             for r, own_columns in enumerate(self.x0):
                 J[r][..., own_columns] = rows[r, ..., P:]
         return self.group.weigh(J).flatten(0, 2)
-
-
-class MappedRows:
-    """w J_φ dφ/dθ: weighted rows for parameters φ that follow from θ; they eliminate no states."""
-
-    states: StartStates | None = None
-
-    def __init__(self, rows: OutputRows, change: Float[Tensor, "Q P"], weight: float) -> None:
-        self._rows, self._change, self._weight = rows, weight * change, weight
-        self._every, self.count = everything(len(change)), rows.count
-
-    def fold(
-        self, kept: Int[Tensor, " K"], total: QRAccumulator | GramAccumulator, room: int
-    ) -> int:
-        """Add the rows [J r], in the kept columns, to the accumulator; see ``TermRows``."""
-        own = type(total)()
-        cached = self._rows.fold(self._every.kept, own, room)
-        change = self._change[:, kept]
-        total.absorb_mapped(own, torch.block_diag(change, change.new_tensor([[self._weight]])))
-        return cached
-
-    def tangent(
-        self, d_theta: Float[Tensor, " P"], reduced: Float[Tensor, " K"]
-    ) -> Float[Tensor, " count"]:
-        """J dθ."""
-        d_phi = self._change @ d_theta
-        return self._rows.tangent(d_phi, d_phi)
-
-    def adjoint(
-        self,
-        residual: Float[Tensor, " count"],
-        gradient: Float[Tensor, " P"],
-        reduced: Float[Tensor, " K"],
-    ) -> None:
-        """Add Jᵀ residual to the gradient."""
-        by_phi = residual.new_zeros(len(self._change))
-        self._rows.adjoint(residual, by_phi, by_phi)
-        gradient += self._change.mT @ by_phi
-
-    def whole(self, parameters: int) -> Float[Tensor, "count P"]:
-        """All rows."""
-        return self._rows.whole(len(self._change)) @ self._change
 
 
 def _product(

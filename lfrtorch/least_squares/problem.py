@@ -23,7 +23,7 @@ from lfrtorch.least_squares.guarantee import Guarantee, Name, guarantee_of
 from lfrtorch.least_squares.jacobian import Jacobian
 from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, Point
 from lfrtorch.least_squares.ridge import Ridge, RidgePenalty, ridge_by_entry
-from lfrtorch.least_squares.simulation_errors import SimulationErrors, SystemErrors
+from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.least_squares.term import Term
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, of_one_unit
@@ -84,48 +84,9 @@ class Problem(LeastSquares):
         return cls(model.lfr, errors, ridge=ridge, guarantee=kept)
 
     @classmethod
-    def of_predictor(
-        cls,
-        model: Model,
-        records: Record | Sequence[Record],
-        simulation: float,
-        *,
-        ridge: Ridge = 0.0,
-        ranks: Ranks | None = None,
-    ) -> Self:
-        """The errors of a predictor and, with a weight, those of the simulations of its system."""
-        # Predictions lean on the measured outputs: a model that predicts well may simulate badly,
-        # or run away. ``simulation`` is the weight if both errors were as large at the start.
-        errors = _errors_of(model, records, Ranks() if ranks is None else ranks)
-        found = cls(model.lfr, errors, ridge=ridge)
-        normalised = [model.scaler.normalise(record) for record in as_records(records)]
-        system = SystemErrors(model.lfr.cell, normalised, errors.ranks)
-        terms: tuple[Term, ...] = errors, system
-        costs = [found.cost(term.evaluate(found.theta)[0]) for term in terms]
-        weight = simulation * math.sqrt(costs[0] / costs[1]) if costs[1] > 0 else 0.0
-        system.weight = weight if math.isfinite(weight) else 0.0
-        found._terms.insert(1, system)
-        return found
-
-    @classmethod
-    def judge(
-        cls, model: Model, records: Record | Sequence[Record], like: Problem | None = None
-    ) -> Self:
+    def judge(cls, model: Model, records: Record | Sequence[Record]) -> Self:
         """The errors on records that are not fitted, each from its most probable initial state."""
-        errors = _errors_of(model, records, Ranks(), solve_initial_states=True)
-        normalised = [model.scaler.normalise(record) for record in as_records(records)]
-        others = [
-            SystemErrors(
-                model.lfr.cell,
-                normalised,
-                errors.ranks,
-                solve_initial_states=True,
-                weight=term.weight,
-            )
-            for term in ([] if like is None else like._terms)
-            if isinstance(term, SystemErrors)
-        ]
-        return cls(model.lfr, errors, others)
+        return cls(model.lfr, _errors_of(model, records, Ranks(), solve_initial_states=True))
 
     @property
     def size(self) -> int:
@@ -198,7 +159,6 @@ class Problem(LeastSquares):
         theta, own = point.theta, self.errors.parameters.own
         states = len(theta) - own
         eliminate = eliminate and states > own and self.ranks.world == 1
-        eliminate = eliminate and all(term.eliminates for term in self._terms)
         if eliminate not in self._checked:  # the same at every θ
             spectral = sum(group.y.numel() for group in self.errors.groups if group.spectral)
             check_fit_memory(self.lfr.cell, 0 if eliminate else states, spectral)

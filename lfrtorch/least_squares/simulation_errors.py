@@ -1,15 +1,10 @@
-"""The errors that a fit is about: simulated minus measured outputs of groups of records.
-
-``SimulationErrors`` are those of a model along its own records. ``SystemErrors`` are those of the
-system that a one-step predictor stands for, as a function of the predictor's parameters.
-"""
+"""The errors that a fit is about: simulated minus measured outputs of groups of records."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -20,11 +15,10 @@ from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.initial_state import estimated_start, start_from_beginning
-from lfrtorch.engine.innovation import split_predictor, split_weights
 from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulation import Trajectory, simulate, steady_state
 from lfrtorch.engine.weights import Weights
-from lfrtorch.least_squares.output_rows import MappedRows, Memory, OutputRows
+from lfrtorch.least_squares.output_rows import Memory, OutputRows
 from lfrtorch.least_squares.record_groups import group_records
 from lfrtorch.least_squares.term import Seen
 from lfrtorch.records import NormalisedRecord
@@ -84,8 +78,6 @@ class SimulationErrors:
 
     # ``solve_initial_states``: estimated initial states are no part of θ, but solved for at every
     # θ, and outputs end at the limits of a record, as in a score.
-
-    eliminates = True
 
     def __init__(
         self,
@@ -180,70 +172,3 @@ class SimulationErrors:
     def release(self) -> None:
         """Free the memory of rows."""
         self._memory = Memory()
-
-
-class SystemErrors:
-    """A term of a problem: errors of simulations by the system that a predictor stands for."""
-
-    # θ are the parameters of the one-step predictor (``engine.innovation``), and φ(θ) are those of
-    # the system. An estimated initial state is one parameter for both: before the first sample the
-    # predictor's state is the system's.
-
-    eliminates = False
-
-    def __init__(
-        self,
-        predictor: LFRCell,
-        records: Sequence[NormalisedRecord],
-        ranks: Ranks,
-        *,
-        solve_initial_states: bool = False,
-        weight: float = 1.0,
-    ) -> None:
-        system, _ = split_predictor(predictor)
-        self._predictor, self.weight = predictor, weight
-        self._errors = SimulationErrors(
-            system,
-            [_without_past_outputs(record, system.nu) for record in records],
-            ranks,
-            solve_initial_states=solve_initial_states,
-        )
-
-    def evaluate(self, theta: Float[Tensor, " P"], near: Seen | None = None) -> tuple[Tensor, Seen]:
-        """Weighted errors at φ(θ), and the trajectories."""
-        residual, seen = self._errors.evaluate(self._system_theta(theta), near)
-        return self.weight * residual, seen
-
-    def linearise(
-        self, theta: Float[Tensor, " P"], seen: Seen, *, eliminate: bool = False
-    ) -> list[MappedRows]:
-        """The rows of each group at θ: those of the system times dφ/dθ."""
-        steps = torch.eye(len(theta)).to(theta)
-        # φ is quadratic, so that this difference is its derivative.
-        change = (self._system_theta(theta + steps) - self._system_theta(theta - steps)).mT / 2.0
-        rows = self._errors.linearise(self._system_theta(theta), seen)
-        return [MappedRows(part, change, self.weight) for part in rows]
-
-    def release(self) -> None:
-        """Free the memory of rows."""
-        self._errors.release()
-
-    def _system_theta(self, theta: Float[Tensor, "*axes n"]) -> Float[Tensor, "*axes m"]:
-        """φ of the free parameters at the beginning of θ, then the initial states in θ."""
-        axes, weights, first = theta.shape[:-1], {}, 0
-        for name, parameter in self._predictor.named_parameters():
-            weights[name] = parameter.detach().expand(*axes, *parameter.shape)
-            if parameter.requires_grad:
-                part = theta[..., first : first + parameter.numel()]
-                weights[name] = part.reshape(*axes, *parameter.shape)
-                first += parameter.numel()
-        found, _ = split_weights(weights)
-        own = [found[name].reshape(*axes, -1) for name in self._errors.parameters.names]
-        return torch.cat([*own, theta[..., first:]], dim=-1)
-
-
-def _without_past_outputs(record: NormalisedRecord, nu: int) -> NormalisedRecord:
-    """The record of the system, from its predictor's."""
-    own = record.record
-    given = replace(own, u=own.u[:, :nu], inputs=own.inputs[:nu])
-    return replace(record, u=record.u[:, :nu], record=given)

@@ -19,9 +19,6 @@ Seen = tuple[Any, ...]
 class Term(Protocol):
     """One summand |r(θ)|² of a problem."""
 
-    eliminates: bool = True
-    """Whether initial states can be eliminated from its rows."""
-
     def evaluate(self, theta: Float[Tensor, " P"], near: Seen | None = None) -> tuple[Tensor, Seen]:
         """r at θ, infinite or NaN where it is undefined, and what else is known there.
 

@@ -28,7 +28,7 @@ OTHERS: dict[str, tuple[Any, ...]] = {
     "static": ("polynomial", torch.nn.Linear),
     "structure": ("wiener", "hammerstein", "wiener_hammerstein", "parallel"),
     "relaxations": (1,), "modes": (2,), "z_feedthrough": (False,),
-    "noise": ("innovation", "both"), "horizon": (50,), "first_part": (0.5,), "average": (2,),
+    "noise": ("innovation",), "horizon": (50,), "first_part": (0.5,), "average": (2,),
     "ridge": (0.1, {"static": 0.1}),
     "known": (KNOWN,), "fixed": ({"Cy": [[1.0, 0.0]]},),
     "init": ("paper",), "init_from": (begun(),), "feedthrough": (False,),

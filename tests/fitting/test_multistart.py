@@ -382,7 +382,7 @@ def test_means_have_the_error_of_starts_whose_predictions_count():
     models = [replace(model, K=K) for model in models]
     options: Any = {"trainer": LevenbergMarquardt(max_iter=0), "average": 2}
     train, validation = [noisy(each) for each in train], noisy(validation)
-    assert fit(models, train, validation, noise="both", **options).averaged == 1
+    assert fit(models, train, validation, noise="innovation", **options).averaged == 1
 
 
 def test_mean_of_starts_is_taken_where_nothing_tells():

@@ -15,10 +15,9 @@ from reference import normal, random_cell, random_model
 import lfrtorch
 from lfrtorch.engine.innovation import predictor_cell, split_predictor
 from lfrtorch.fitting.settings import Settings
-from lfrtorch.least_squares.problem import Problem
 from lfrtorch.metrics import rms
 from lfrtorch.model import Model
-from lfrtorch.records import Record, Start, with_past_outputs
+from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric
 
@@ -152,55 +151,6 @@ def test_what_an_observer_cannot_follow_is_refused(said: str, act):
     model, record, _ = noisy(20)
     with pytest.raises(ValueError, match=said):
         act(model, record)
-
-
-@pytest.mark.parametrize("start", ["zero", "estimated"])
-def test_the_derivatives_of_both_errors_are_those_of_differences(start: Start):
-    model, record, _ = noisy(60)
-    parts = [replace(part, skip=5, start=start) for part in (record[:25], record[25:])]
-    driven = [with_past_outputs(part) for part in parts]
-    problem = Problem.of_predictor(model.predictor(), driven, simulation=0.5)
-    free = (~problem.fixed).to(problem.theta)
-    theta = problem.theta + 0.01 * normal(len(free)) * free
-    d_theta, h = normal(len(free), seed=1) * free, 1e-5
-    r, jacobian = problem.residual(theta), problem.linearise(theta)
-    ahead, back = problem.residual(theta + h * d_theta), problem.residual(theta - h * d_theta)
-    differences = (ahead - back) / (2 * h)
-    error = (jacobian.tangent(d_theta) - differences).norm() / differences.norm()
-    assert float(error) < 1e-6
-    _, gradient = jacobian.system(1e-8, 1e-12)
-    assert float(gradient @ d_theta) == pytest.approx(float(r @ differences), rel=1e-6)
-    torch.testing.assert_close(jacobian.adjoint(r), gradient, rtol=1e-8, atol=1e-10)
-
-
-def test_both_errors_are_as_large_at_the_start_as_the_weight_says():
-    model, record, _ = noisy(60)
-    problem = Problem.of_predictor(model.predictor(), with_past_outputs(record), simulation=2.0)
-    predicted, simulated = problem.residual(problem.theta).reshape(2, -1).norm(dim=1)
-    assert float(simulated / predicted) == pytest.approx(2.0)
-
-
-@pytest.mark.slow
-def test_a_fit_of_both_simulates_better_than_that_of_predictions():
-    """One sample ahead y is nearly y(k - 1), whatever u is: predictions hardly tell of the gain."""
-    rng = np.random.default_rng(2)
-    u, y, x = np.repeat(rng.standard_normal(60), 10), np.zeros(600), 0.0
-    for k in range(600):
-        y[k] = x + 0.02 * rng.standard_normal()
-        x = 0.98 * x + 0.02 * np.tanh(2.0 * u[k]) - 0.02 * x**3
-    train, test = (
-        Record(u[part], y[part], name=name, skip=20, start="estimated")
-        for name, part in (("train", slice(0, 400)), ("test", slice(400, 600)))
-    )
-    linear = lfrtorch.estimate_bla(train, nx=1, refine="prediction")
-    trainer = lfrtorch.LevenbergMarquardt(max_iter=10)
-    errors = {}
-    for noise in ("innovation", "both"):
-        start = lfrtorch.initialise(linear, train, nz=1, nw=1, nn=3)
-        model = lfrtorch.fit(start, train, noise=cast(Any, noise), trainer=trainer).model
-        errors[noise] = lfrtorch.rmse(train, model.simulate(train))
-        assert np.isfinite(model.predict(test)).all()
-    assert errors["both"] < errors["innovation"]
 
 
 def test_a_gain_goes_with_its_model_or_not_at_all():

@@ -327,7 +327,7 @@ def test_a_nonlinearity_of_the_states_alone(method, tmp_path):
 
 
 @pytest.mark.parametrize("z_feedthrough", [True, False])
-@pytest.mark.parametrize("noise", ["output", "innovation", "both"])
+@pytest.mark.parametrize("noise", ["output", "innovation"])
 def test_without_feedthrough_an_input_acts_later(noise, z_feedthrough, tmp_path):
     """Neither by Dyu nor through w, before and after a fit, and saved so."""
     refine = "simulation" if noise == "output" else "prediction"
