@@ -1,14 +1,13 @@
 """Cross-validation of the cascaded tanks' settings, on the estimation record alone.
 
-    python benchmarks/tanks.py --root DIR [--starts 6] [--distil]
+    python benchmarks/tanks.py --root DIR [--starts 6]
 
 Each eighth of the estimation record is left out once: the rest trains, without a validation part,
 and the model simulates the record through what was left out. All begin at the linear model of the
 whole record, as that of seven eighths may spend a mode on drift. Prints the RMSE over all eighths,
 V: of the median start, and of the mean of all starts that stay stable on inputs twice as loud; and
-that of this mean over the six eighths without a level of 10 V. With --distil, for the settings of
-the benchmark and each eighth: of the best start in training, of the mean of all, and of one model
-in its place. The official test record is not looked at.
+that of this mean over the six eighths without a level of 10 V. The official test record is not
+looked at.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import argparse
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -39,12 +37,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--starts", type=int, default=6)
-    parser.add_argument("--distil", action="store_true")
     options = parser.parse_args()
     (measured,) = cascaded_tanks.load(root=options.root, validation=0).train
-    if options.distil:
-        distilled(measured, options.starts)
-        return 0
     print("| limit | neurons | ridge | median start | mean of all | without a level of 10 V |")
     print("|---" * 6 + "|")
     for limit, nn, ridge in TRIED:
@@ -66,25 +60,6 @@ def left_out_of(whole: lfrtorch.Record, part: Fold) -> lfrtorch.Record:
     """The record up to the end of what was left out, the rest skipped."""
     ((first, last),) = part.windows
     return replace(whole[:last], start=whole.start, x0=whole.x0, skip=max(first, SKIP))
-
-
-def distilled(whole: lfrtorch.Record, starts: int) -> None:
-    """A row for each eighth."""
-    trainer = lfrtorch.LevenbergMarquardt(max_iter=ITERATIONS)
-    bla = lfrtorch.estimate_bla(whole, nx=2)
-    print("| eighth | best start | mean | one model |\n|---|---|---|---|")
-    for number, part in enumerate(folds(as_folded(whole), PARTS), 1):
-        judged = left_out_of(whole, part)
-        models = [
-            lfrtorch.initialise(bla, part.train, **SIZES, nn=15, seed=1000 * i)
-            for i in range(starts)
-        ]
-        quiet: dict[str, Any] = {"trainer": trainer, "ridge": 1.0}
-        mean = lfrtorch.fit(models, part.train, average=starts, **quiet)
-        one = lfrtorch.distil(mean, part.train, **quiet)
-        found = mean.members[0], mean.model, one.model
-        errors = [f"{lfrtorch.rmse(judged, model.simulate(judged)):.3f}" for model in found]
-        print("|", " | ".join([str(number), *errors]), "|", flush=True)
 
 
 def left_out(

@@ -34,7 +34,6 @@ _NAMES = {
     "extended_kalman_filter": "NoiseCovariance",
     "known": "Known Parameter State",
     "model": "Model load simulate_blocks",
-    "fitting.distillation": "distil",
     "fitting.forgetting": "Memory forgets",
     "fitting.means": "mean_model",
     "fitting.multistart": "fit",

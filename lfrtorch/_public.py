@@ -25,7 +25,6 @@ from lfrtorch.known import Known, Parameter, State
 from lfrtorch.model import Model, load, simulate_blocks
 
 # fits
-from lfrtorch.fitting.distillation import distil
 from lfrtorch.fitting.forgetting import Memory, forgets
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
@@ -88,7 +87,6 @@ __all__ = [
     "analysis",
     "choose_sizes",
     "datasets",
-    "distil",
     "distributed",
     "estimate_bla",
     "estimate_frf",

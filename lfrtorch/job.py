@@ -33,7 +33,7 @@ from lfrtorch.fitting.from_outputs import (
 )
 from lfrtorch.fitting.given_entries import checked, shapes, with_given
 from lfrtorch.fitting.known_start import known_starts
-from lfrtorch.fitting.last_fits import distilled, refitted, without_poor_starts
+from lfrtorch.fitting.last_fits import refitted, without_poor_starts
 from lfrtorch.fitting.multistart import cheap_starts, fit
 from lfrtorch.fitting.observer import LineObserver, Observer
 from lfrtorch.fitting.plain_settings import PlainSettings
@@ -241,8 +241,6 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     observer.end(result)
     if choice is not None:
         result = without_poor_starts(stage, result)
-    if settings.distil:
-        result = distilled(replace(stage, settings=settings), result)
     again = None
     if settings.refit:
         result, again = refitted(replace(given, settings=settings), result)

@@ -112,7 +112,6 @@ def of_functions(folder: Path) -> list[Case]:
     trainer = lfrtorch.LevenbergMarquardt(max_iter=1)
     one = lfrtorch.fit(begin(), record, trainer=trainer, monitors=[])
     several: Any = [begin(seed=seed) for seed in range(2)]
-    mean = lfrtorch.fit(several, record, trainer=trainer, average=2, monitors=[[], []])
     predicting = lfrtorch.estimate_bla(record, 2, refine="prediction", max_iter=3)
     inside: Any = lfrtorch.initialise(predicting, record, nz=1, nw=1, nn=2)
     inside = lfrtorch.fit(inside, record, noise="innovation", trainer=trainer, monitors=[]).model
@@ -130,7 +129,6 @@ def of_functions(folder: Path) -> list[Case]:
         (lfrtorch.initialise, {"bla": bla, "records": record, "nz": 1, "nw": 1, "nn": 2}),
         (lfrtorch.fit, {"models": model, **fitted}),
         (lfrtorch.refit, {"result": one, "held_out": short, **fitted}),
-        (lfrtorch.distil, {"result": mean, "validation": short, **fitted}),
         (lfrtorch.mean_model, {"models": several}),
         (lfrtorch.choose_sizes, {"records": record, "linear": lambda nx: bla, **choosing}),
         (lfrtorch.rmse, {"record": record, "y_hat": flat}),

@@ -397,23 +397,6 @@ def test_a_part_has_the_shortest_records():
     assert all(np.array_equal(a.y, b.y[: a.samples]) for a, b in zip(short, records, strict=True))
 
 
-@pytest.mark.slow
-def test_one_model_takes_the_place_of_a_mean_if_it_does_as_well(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    asked = settings(starts=2, average=2, distil=True)
-    run = identify(replace(dataset, validation=[]), asked)  # the mean is taken
-    assert run.model.sizes["nx"] == 1
-    assert run.metrics["distilled"] == 2
-    assert "stands for the mean of the best 2 starts" in str(run)
-    identify(dataset, settings(distil=True), observer=Console())
-    assert "note: distil: the model is no mean" in capsys.readouterr().out
-    monkeypatch.setattr("lfrtorch.fitting.multistart.AS_GOOD", 10.0)
-    for ratio, states in ((10.0, 1), (0.0, 2)):
-        monkeypatch.setattr("lfrtorch.fitting.last_fits.AS_GOOD", ratio)
-        assert identify(dataset, asked).model.sizes["nx"] == states
-
-
 def test_a_refit_is_scored_on_tests_and_validation_is_that_before(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -1,4 +1,4 @@
-"""What may follow a fit: one model in the place of a mean, and a fit to all estimation records."""
+"""What may follow a fit: a mean without poor starts, and a fit to all estimation records."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ from functools import partial
 import torch
 
 from lfrtorch._support.reasons import CUT_SHORT, Reason
-from lfrtorch._support.tables import number, quantity
+from lfrtorch._support.tables import quantity
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
-from lfrtorch.fitting.distillation import distil
 from lfrtorch.fitting.first_fit import cost_in_full
 from lfrtorch.fitting.means import mean_model
-from lfrtorch.fitting.multistart import AS_GOOD
 from lfrtorch.fitting.prediction import predicting
 from lfrtorch.fitting.refit import refit
 from lfrtorch.fitting.stage import Stage
@@ -26,45 +24,6 @@ from lfrtorch.records import common_unit
 _AVERAGED, _POOR = 3, 2.0
 """Starts of a mean that no held-out record judges, and their training errors over the least, at
 most: the start with the least may be the one that is overfitted (``benchmarks/first_try.md``)."""
-
-
-def distilled(stage: Stage, result: FitResult) -> FitResult:
-    """The fit with one model in the place of a mean, if it does as well on validation."""
-    dataset, settings, observer = stage.dataset, stage.settings, stage.observer
-    if result.reason in CUT_SHORT:
-        return result
-    if not result.members:
-        observer.say("note: distil: the model is no mean of several starts; it stays")
-        return result
-    one = _whole_or_cut(
-        result,
-        partial(
-            distil,
-            result,
-            dataset.train,
-            dataset.validation,
-            trainer=settings.trainer,
-            seed=settings.seed,
-            monitor=observer.searching(),
-            ranks=stage.ranks,
-            stop=stage.stop,
-        ),
-    )
-    if one.reason in CUT_SHORT:
-        return one
-    judged = dataset.validation or dataset.train
-    problems = [Problem.judge(m, judged) for m in (one.model, result.model)]
-    costs = [problem.evaluate(problem.theta).cost for problem in problems]
-    found, mean = stage.ranks.first(torch.tensor(costs, dtype=torch.float64)).sqrt().tolist()
-    taken = found <= AS_GOOD * mean or not dataset.validation
-    on = "validation" if dataset.validation else "training"
-    observer.say(
-        f"one model for the mean of {result.averaged}: its error on {on} is "
-        f"{number(found / mean)} of the mean's{'' if taken else '; the mean stays'}"
-    )
-    if not taken:
-        return result
-    return replace(result, model=one.model, averaged=1, members=(), distilled=result.averaged)
 
 
 def without_poor_starts(stage: Stage, result: FitResult) -> FitResult:

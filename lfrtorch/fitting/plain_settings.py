@@ -92,11 +92,6 @@ class PlainSettings:
         "well, see :func:`lfrtorch.fit`.",
         least=1,
     )
-    distil: bool = setting(
-        False,
-        "whether one model takes the place of a mean of several if it does as well, see "
-        ":func:`lfrtorch.distil`.",
-    )
     refit: bool = setting(
         False,
         "whether the model that validation chose is fitted to all estimation records at last, see "

@@ -134,8 +134,6 @@ class FitResult:
         averaged: number of starts that the model is the mean of; history and iterate are those
             of the best one.
         members: the models of these starts; none if it is no mean.
-        distilled: number of starts whose mean the model stands for, see :func:`lfrtorch.distil`; 0
-            if it does not.
 
     Example:
         >>> result = lfrtorch.fit(model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=3))
@@ -155,7 +153,6 @@ class FitResult:
     averaged: int = 1
     detail: str = ""
     members: tuple[Model, ...] = field(default=(), repr=False)
-    distilled: int = 0
 
     @property
     def iterations(self) -> int:

@@ -76,7 +76,6 @@ def metrics(
         "memory": None if memory is None else memory._asdict(),
         "starts": max(1, len(result.starts)),
         "averaged": result.averaged,
-        "distilled": result.distilled,
         "ranking": [
             {"seed": settings.seeds[start.number], **asdict(start)} for start in result.starts
         ],
@@ -283,7 +282,7 @@ def static_map(sizes: Mapping[str, int], known_states: int = 0) -> str:
 
 def in_words(result: Mapping[str, Any]) -> str:
     """The sizes of the model of what :func:`metrics` returns; of a mean those of each model."""
-    count = 1 if result.get("distilled") else result.get("averaged", 1)
+    count = result.get("averaged", 1)
     each = {name: size // count for name, size in result["sizes"].items()}
     words = static_map(each, result["known_states"] // count)
     return f"mean of {count} models with {words}" if count > 1 else words
@@ -318,8 +317,6 @@ def origins(result: Mapping[str, Any]) -> list[str]:
     said = []
     if result["averaged"] > 1:
         said.append(f"The model is the mean of the best {result['averaged']} starts.")
-    if result["distilled"]:
-        said.append(f"The model stands for the mean of the best {result['distilled']} starts.")
     if result["refit"] is not None:
         said.append("Refitted to all estimation records: validation errors are those before it.")
     return said

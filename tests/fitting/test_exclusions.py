@@ -32,7 +32,7 @@ OTHERS: dict[str, tuple[Any, ...]] = {
     "ridge": (0.1, {"static": 0.1}),
     "known": (KNOWN,), "fixed": ({"Cy": [[1.0, 0.0]]},),
     "init": ("paper",), "init_from": (begun(),), "feedthrough": (False,),
-    "distil": (True,), "guarantee": ("stable", "contracting"), "integrators": (1,),
+    "guarantee": ("stable", "contracting"), "integrators": (1,),
 }  # fmt: skip
 """Values that are no defaults."""
 

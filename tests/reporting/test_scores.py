@@ -196,7 +196,7 @@ def test_neurons_in_words():
 def test_a_mean_is_called_so_with_the_sizes_of_each_model():
     summed = {"sizes": {"nx": 6, "nz": 9, "nw": 9, "nn": 48}, "known_states": 0, "averaged": 3}
     each = "nx 2, nz 3, nw 3, 16 neurons"
-    assert report.in_words({**summed, "distilled": 0}) == f"mean of 3 models with {each}"
+    assert report.in_words(summed) == f"mean of 3 models with {each}"
     assert report.in_words({**summed, "averaged": 1}).startswith("nx 6")
 
 
