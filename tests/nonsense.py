@@ -148,7 +148,6 @@ def of_functions(folder: Path) -> list[Case]:
         (analysis.residuals, {"model": model, "records": record}),
         (analysis.response_band, {"model": bla, "frequencies": [0.1, 0.2]}),
         (analysis.spread, {"models": several, "data": record}),
-        (analysis.structure, {"model": model, "records": record}),
         (analysis.uncertainty, {"model": model, "records": record}),
         (model.simulate, {"data": record}),
         (inside.predict, {"record": record}),

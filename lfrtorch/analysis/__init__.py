@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from lfrtorch._support.arguments import typed
-from lfrtorch.analysis.block_structure import Structure, structure
 from lfrtorch.analysis.bounds import Bound, bound
 from lfrtorch.analysis.canonical_form import Canonical, canonical
 from lfrtorch.analysis.confidence_bands import Band, Uncertainty, spread, uncertainty
@@ -33,7 +32,6 @@ __all__ = [
     "PoleBand",
     "Residuals",
     "ResponseBand",
-    "Structure",
     "Trim",
     "Uncertainty",
     "bound",
@@ -47,7 +45,6 @@ __all__ = [
     "residuals",
     "response_band",
     "spread",
-    "structure",
     "trim",
     "uncertainty",
 ]
