@@ -84,6 +84,7 @@ def _rows(
     by, of_direct = np.empty((len(own), wide), rows.dtype), np.empty((n_own, wide), rows.dtype)
     d_w = np.zeros((nw, len(column) - n_x))
     J, by_weight = np.zeros((SAMPLES, nw, nz)), np.zeros((nw, len(phi)))
+    stride = len(phi) if len(static) else 0
     v = np.empty((SAMPLES, nx + u.shape[1] + nw))
     for i in range(nx):
         for n in range(n_own):
@@ -99,7 +100,7 @@ def _rows(
             t = t_first + t0 + b
             signals(x, u, w, t, v[b])
             if nw:
-                call_slope(slope, ints, constants, phi, z[t], J[b], by_weight, len(phi), work)
+                call_slope(slope, ints, constants, phi, z[t], J[b], by_weight, stride, work)
             for q in range(nw if len(Sw) > 0 else 0):
                 row = d_w[q]
                 for n in range(n_z):

@@ -85,7 +85,7 @@ def record_rows(
         if whole:
             call_slope(slope, ints, constants, phi, z[t], J, in_place, width, room)
         elif nw:
-            call_slope(slope, ints, constants, phi, z[t], J, by_weight, P, room)
+            call_slope(slope, ints, constants, phi, z[t], J, by_weight, P * (s1 > s0), room)
             for q in range(nw):
                 for c in range(s0, s1):
                     X[nx + q, c - c0] = by_weight[q, static[c - first]]

@@ -145,8 +145,7 @@ def _static(Cz, x, Dzu, u, nw, phi, code):
     affine(Cz, x, Dzu, u, z)
     if nw:
         call_value(code[1], code[3], code[4], phi, z, w, room)
-        by_weight = np.empty(nw * len(phi))
-        call_slope(code[2], code[3], code[4], phi, z, J, by_weight, len(phi), room)
+        call_slope(code[2], code[3], code[4], phi, z, J, np.empty(0), 0, room)
     return w, J
 
 

@@ -54,8 +54,8 @@ class Trainer(Protocol):
         """What every model on the way keeps: a stable A, or contraction."""
         ...
 
-    def init(self, problem: Any, theta: Tensor) -> Any:
-        """State at the start."""
+    def init(self, problem: Any, theta: Tensor, point: Point | None = None) -> Any:
+        """State at the start, and what was found there if it is known."""
         ...
 
     def step(self, problem: Any, state: Any) -> Any:
@@ -210,7 +210,8 @@ class Fit:
         """Where it stands; None before the first call of ``advance``."""
         self.note_end(Reason.NO_ITERATIONS)
         theta = self.problem.theta
-        if not math.isfinite(self.problem.evaluate(theta).cost):
+        self._start: Point | None = self.problem.evaluate(theta)
+        if not math.isfinite(self._start.cost):
             self.note_end(Reason.START_DIVERGES)
             limit = self.trainer.limit
             lost = Progress(0, limit, math.inf, math.nan, 0.0, False, {}, math.inf)
@@ -339,7 +340,8 @@ class Fit:
     def _begun(self) -> FitState:
         """State at the start."""
         clock = time.perf_counter()
-        start = self.trainer.init(self.problem, self.problem.theta)
+        start = self.trainer.init(self.problem, self.problem.theta, self._start)
+        self._start = None  # its trajectories are the state's now
         at = FitState(start, (), start.theta, ())
         return self._entered(at, start, time.perf_counter() - clock)
 

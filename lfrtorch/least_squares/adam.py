@@ -84,10 +84,10 @@ class Adam(AdamOptions):
         """Most iterations."""
         return self.max_iter
 
-    def init(self, problem: Differentiable, theta: Tensor) -> AdamState:
-        """State at the first θ."""
-        point, gradient = problem.gradient(theta)
-        return AdamState(*point, gradient)
+    def init(self, problem: Differentiable, theta: Tensor, point: Point | None = None) -> AdamState:
+        """State at the first θ, and what was found there if it is known."""
+        found, gradient = problem.gradient(theta, point)
+        return AdamState(*found, gradient)
 
     def step(self, problem: Differentiable, state: AdamState) -> AdamState:
         """One epoch."""

@@ -178,9 +178,9 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
         """Most iterations."""
         return self.max_iter
 
-    def init(self, problem: LeastSquares, theta: Tensor) -> LMState:
-        """State at the first θ."""
-        point = problem.evaluate(theta)
+    def init(self, problem: LeastSquares, theta: Tensor, point: Point | None = None) -> LMState:
+        """State at the first θ, and what was found there if it is known."""
+        point = problem.evaluate(theta) if point is None else point
         if not math.isfinite(point.cost):
             raise InputError(
                 "the residual is not finite at the start of the search; start from a stable model."

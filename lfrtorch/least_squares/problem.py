@@ -173,7 +173,8 @@ class Problem(LeastSquares):
         if reduce and not eliminate and self._worth_reducing:
             reduced = self._reduction(theta)
         bounded = None if self._guarantee is None else partial(self._guarantee.bounded, theta)
-        return Jacobian(rows, reduced, self.fixed, self.ranks, shared, self.rank, bounded)
+        rank = len(reduced.kept) if reduced.expand is not None else self.rank
+        return Jacobian(rows, reduced, self.fixed, self.ranks, shared, rank, bounded)
 
     @cached_property
     def _worth_reducing(self) -> bool:
@@ -213,8 +214,12 @@ class Problem(LeastSquares):
     def gradient(
         self, theta: Float[Tensor, " P"], near: Point | None = None
     ) -> tuple[Point, Float[Tensor, " P"]]:
-        """r at θ and the gradient of |r|² / samples, by the adjoint recurrence."""
-        point = self.evaluate(theta, near)
+        """r at θ and the gradient of |r|² / samples, by the adjoint recurrence.
+
+        ``near`` is a point close by, or at θ itself.
+        """
+        known = near is not None and near.theta is theta
+        point = near if near is not None and known else self.evaluate(theta, near)
         return point, 2.0 / self.size * self.linearise_at(point, reduce=False).adjoint(
             point.residual
         )

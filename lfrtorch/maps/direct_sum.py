@@ -226,7 +226,7 @@ def _slope(ints, constants, weights, z, J, by_weight, stride, room):
     for q in range(nw):
         for j in range(nz):
             J[q * nz + j] = 0.0
-        for n in range(P):
+        for n in range(P if stride else 0):
             by_weight[q * stride + n] = 0.0
     at_z = at_w = at_phi = 0
     for part in range(ints[0]):

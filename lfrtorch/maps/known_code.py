@@ -125,7 +125,7 @@ def known_slope(ints, constants, weights, z, J, by_weight, stride, room):
             slope = (S[i, j] if i < nx else Y[i - nx, j]) / constants[of_w + 2 * i + 1]
             if j < nz:
                 J[i * nz + j] = slope * constants[2 + 2 * j]
-            else:
+            elif stride:
                 by_weight[i * stride + j - nz] = slope * constants[p_scale + j - nz]
 
 

@@ -111,13 +111,13 @@ def _slopes(first, jobs, step, code, phi, z, which, out):
     """Write ∂w/∂z (which = 0) or ∂w/∂φ (1) of all samples of every record of these jobs."""
     slope, ints, constants, room = code[2], code[3], code[4], prepared(code, phi)
     nw, P = out.shape[2], len(phi)
-    other = np.empty(nw * (P if which == 0 else z.shape[2]))
+    J, none = np.empty(nw * z.shape[2]), np.empty(0)
     for r in range(first, jobs, step):
         for k in range(z.shape[1]):
             if which == 0:
-                call_slope(slope, ints, constants, phi, z[r, k], out[r, k], other, P, room)
+                call_slope(slope, ints, constants, phi, z[r, k], out[r, k], none, 0, room)
             else:
-                call_slope(slope, ints, constants, phi, z[r, k], other, out[r, k], P, room)
+                call_slope(slope, ints, constants, phi, z[r, k], J, out[r, k], P, room)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})

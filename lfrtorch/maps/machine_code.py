@@ -29,7 +29,7 @@ SLOPE = types.void(
     _INTS, _DOUBLES, _DOUBLES, _DOUBLES, _DOUBLES, _DOUBLES, types.int64, _DOUBLES
 )  # fmt: skip
 """A slope: (ints, constants, weights, z, J, by_weight, stride, room) -> None, which writes ∂w/∂z
-(nw, nz) and ∂w/∂weights (nw, P), whose rows are ``stride`` numbers apart."""
+(nw, nz) and ∂w/∂weights (nw, P), whose rows are ``stride`` numbers apart; of 0 the first alone."""
 
 
 class Code(NamedTuple):

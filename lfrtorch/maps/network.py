@@ -269,6 +269,8 @@ def _slope(ints, constants, weights, z, J, by_weight, stride, room):
             room[v + n] = room[Ww + q * lanes + n] * room[s + n]
         for j in range(nz):
             J[q * nz + j] = dot(room, j * lanes, room, v, lanes)
+        if stride == 0:
+            continue
         if nz == 1:  # strides that are known become vector instructions
             z0 = z[0]
             for n in range(nn):

@@ -188,12 +188,14 @@ def _slope(ints, constants, weights, z, J, by_weight, stride, room):
         dm[factor, n] += m[before]
     P = nw * count
     for q in range(nw):
-        for n in range(P):
-            by_weight[q * stride + n] = 0.0
-        for n in range(count):
-            by_weight[q * stride + q * count + n] = m[n]
         for j in range(nz):
             a = 0.0
             for n in range(count):
                 a += weights[q * count + n] * dm[j, n]
             J[q * nz + j] = a
+        if stride == 0:
+            continue
+        for n in range(P):
+            by_weight[q * stride + n] = 0.0
+        for n in range(count):
+            by_weight[q * stride + q * count + n] = m[n]

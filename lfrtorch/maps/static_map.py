@@ -328,5 +328,5 @@ def _formula_slope(ints, constants, weights, z, J, by_weight, stride, room):
         row = nw + q * (nz + P)
         for j in range(nz):
             J[q * nz + j] = out[row + j]
-        for j in range(P):
+        for j in range(P if stride else 0):
             by_weight[q * stride + j] = out[row + nz + j]

@@ -71,7 +71,7 @@ class Walk:
     def limit(self) -> int:
         return len(self.offsets)
 
-    def init(self, problem: Any, theta: Tensor) -> State:
+    def init(self, problem: Any, theta: Tensor, point: Point | None = None) -> State:
         return self.State(theta, problem.evaluate(theta), report={})
 
     def step(self, problem: Any, state: State) -> State:
@@ -389,9 +389,9 @@ def test_seconds_are_those_of_steps_and_their_judgement(monkeypatch):
 
     @dataclass(frozen=True)
     class Slow(Walk):
-        def init(self, problem, theta):
+        def init(self, problem, theta, point=None):
             passes(4.0)
-            return super().init(problem, theta)
+            return super().init(problem, theta, point)
 
         def step(self, problem, state):
             passes(8.0)
