@@ -334,7 +334,6 @@ def commands(run: Path, values: Sequence[str]) -> Iterator[Case]:
         "evaluate": ([made, *given], ["checkpoint", "out", "overwrite", *data]),
         "linear": ([*given, "nx=1", "threads=1", "hydra.run.dir=r"], [*linear.split(), *data]),
         "preview": ([str(csv)], data),
-        "compare": ([str(run)], ["out"]),
     }
     for word, (base, names) in words.items():
         lines = [[*base, f"{name}={value}"] for name in names for value in values]

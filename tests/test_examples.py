@@ -2,6 +2,8 @@
 
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -85,3 +87,14 @@ def test_optuna_searches_around_identify(capsys: pytest.CaptureFixture[str]):
     assert study.best_value < 0.011  # the noise is 0.01 rms
     printed = capsys.readouterr().out
     assert printed.startswith(f"{study.best_params}\nBetter than the linear model")
+
+
+@pytest.mark.slow
+@pytest.mark.numeric
+def test_ray_fits_many_settings(capfd: pytest.CaptureFixture[str]):
+    pytest.importorskip("ray", reason="needs ray: pip install ray")
+    subprocess.run([sys.executable, EXAMPLES / "ray_sweep.py"], check=True)
+    found = [float(e) for e in re.findall(r"nn=\d seed=\d: ([\d.]+) rms", capfd.readouterr().out)]
+    assert len(found) == 6
+    assert found == sorted(found)
+    assert found[0] < 0.015  # the noise has 0.01

@@ -48,10 +48,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
     names = {name for name in ZipFile(wheel).namelist() if ".dist-info/" not in name}
-    rooms = ("lfrtorch", "hydra_plugins")
-    sources = {
-        str(path.relative_to(ROOT)) for room in rooms for path in (ROOT / room).rglob("*.py")
-    }
+    sources = {str(path.relative_to(ROOT)) for path in (ROOT / "lfrtorch").rglob("*.py")}
     settings = {f"lfrtorch/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
     folders = (ROOT / "lfrtorch").rglob("templates")
     templates = [path for folder in folders for path in folder.rglob("*") if path.is_file()]

@@ -16,7 +16,6 @@ COMMANDS = {
     "preview": "look at measurements before any fit",
     "linear": "frequency response and best linear approximation",
     "fit": "identify a nonlinear LFR model, from records to report",
-    "compare": "many runs in one table and one page",
     "evaluate": "score a saved model on a dataset",
     "simulate": "run a saved model on the inputs of files",
     "export": "write a saved model as C, CasADi, ONNX, MATLAB, Python or FMU",

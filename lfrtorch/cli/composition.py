@@ -41,17 +41,16 @@ SWEEPS = {"-m", "--multirun"}
 _DATE = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d-\d{6}")  # hydra.run.dir of a run of its own
 _SETTING = re.compile(r"[+~]*(?:hydra/)?[\w.]+=")  # what a word NAME=VALUE begins with
 # Commands whose data are a group.
-_DATA_CHOSEN = {"config", "linear", "evaluate", "compare", "preview"}
+_DATA_CHOSEN = {"config", "linear", "evaluate", "preview"}
 _LISTS = {"data.inputs", "data.outputs", "data.reference"}
 
 
 def take_words(
     command: str,
     whole: Callable[[Sequence[str]], list[str]] = list,
-    unnamed: str = "data.path",
 ) -> None:
     """Check the words, after ``whole`` has completed them, and quote them for Hydra."""
-    given = [of_newest(word) for word in in_full(command, sys.argv[1:], unnamed)]
+    given = [of_newest(word) for word in in_full(command, sys.argv[1:])]
     completed = whole(given)
     if command == "config":
         completed = [*completed, *chosen_by_data(completed)]
@@ -59,9 +58,9 @@ def take_words(
     check_words(command, given, sys.argv[1:])
 
 
-def in_full(command: str, given: Sequence[str], unnamed: str = "data.path") -> list[str]:
+def in_full(command: str, given: Sequence[str]) -> list[str]:
     """The words with all that follows from them: ``x.csv inputs=u`` are a file and its columns."""
-    words = with_names(given, unnamed)
+    words = with_names(given)
     names = [word.partition("=")[0].lstrip("+") for word in words]
     at = next((i for i, name in enumerate(names) if name in ("path", "data.path")), None)
     chosen = not {"data", "bench", "resume"}.isdisjoint(names)
@@ -105,8 +104,8 @@ def chosen_by_data(words: Sequence[str]) -> list[str]:
     return [f"{name}=auto" for name in sorted({"nx"} | static) if name not in given]
 
 
-def with_names(given: Sequence[str], option: str) -> list[str]:
-    """The words, those without a name as values of ``option``; of data only what may be a file."""
+def with_names(given: Sequence[str]) -> list[str]:
+    """The words, those without a name that may be files as values of ``data.path``."""
     other = [
         word
         for word in given
@@ -114,17 +113,16 @@ def with_names(given: Sequence[str], option: str) -> list[str]:
         or word[0] == "-"
         or (word[0] == "~" and "/" not in word)
         or (_SETTING.match(word) and not os.path.exists(word))
-        or (option == "data.path" and not _may_be_file(word))
+        or not _may_be_file(word)
     ]
-    paths = [_plain_or_quoted(option, word) for word in given if word not in other]
+    paths = [_plain_or_quoted("data.path", word) for word in given if word not in other]
     if not paths:
         return other
-    short = option.rpartition(".")[2]
-    if any(word.startswith((f"{option}=", f"{short}=")) for word in other):
-        raise InputError(f"{option} is given twice; a path alone is {option}, too.")
+    if any(word.startswith(("data.path=", "path=")) for word in other):
+        raise InputError("data.path is given twice; a path alone is data.path, too.")
     value = paths[0] if len(paths) == 1 else f"[{','.join(paths)}]"
     at = next(i for i, word in enumerate(given) if word not in other)  # options stay where they are
-    return [*other[:at], f"{option}={value}", *other[at:]]
+    return [*other[:at], f"data.path={value}", *other[at:]]
 
 
 def _may_be_file(word: str) -> bool:
@@ -175,7 +173,6 @@ def started(
     command: str,
     work: Callable[[DictConfig], object],
     whole: Callable[[Sequence[str]], list[str]] = list,
-    unnamed: str = "data.path",
 ) -> None:
     """Start a command of one run; errors of users end it with a line."""
 
@@ -184,7 +181,7 @@ def started(
             work(cfg)
 
     with user_errors():
-        take_words(command, whole, unnamed)
+        take_words(command, whole)
     hydra.main(**MAIN, config_path=str(CONF), config_name=command)(job)()
 
 

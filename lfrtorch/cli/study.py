@@ -25,19 +25,16 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from hydra.core.config_store import ConfigStore
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from threadpoolctl import threadpool_limits
 
-from hydra_plugins.lfrtorch_ray import RayLauncherConf
 from lfrtorch._support import tables
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch.cli.claim import tidy
 from lfrtorch.cli.composition import SWEEPS, parsed
-from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.interrupts import TerminatedError
 from lfrtorch.cli.quotes import register_resolver
 from lfrtorch.cli.run_folder import SNAPSHOTS
@@ -51,8 +48,8 @@ ATTEMPTS = 3
 """How often the runs that are left are begun if processes are killed that many runs share."""
 
 
-_KILLED = {"BrokenProcessPool", "UncompletedJobError", "WorkerCrashedError", "NodeDiedError"}
-"""Errors of joblib, submitit and Ray if one of their processes is."""
+_KILLED = {"BrokenProcessPool", "UncompletedJobError"}
+"""Errors of joblib and submitit if one of their processes is."""
 
 LOADED = ("lfrtorch.cli.fit", "lfrtorch._public", "pandas", "scipy.signal")
 
@@ -60,7 +57,6 @@ LAUNCHERS = {
     "joblib": "hydra_plugins.hydra_joblib_launcher",
     "submitit_local": "hydra_plugins.hydra_submitit_launcher",
     "submitit_slurm": "hydra_plugins.hydra_submitit_launcher",
-    "ray": "ray",
 }
 """What starts several runs at once, and the package that it needs."""
 
@@ -80,9 +76,6 @@ def folder_name(varied: str) -> str:
 
 
 register_resolver("folder_name", folder_name, replace=True)
-ConfigStore.instance().store(
-    group="hydra/launcher", name="ray", node=RayLauncherConf, provider="lfrtorch"
-)  # here, not in its module, which Hydra imports in every program of this environment
 
 
 def study_words(given: Sequence[str]) -> list[str]:
@@ -194,7 +187,6 @@ def _apart(
     theirs.close()
     try:
         while process.exitcode is None:
-            # No signal wakes a worker of Ray: it looks whether its run is to end.
             process.join(1.0)
     except KeyboardInterrupt:  # it was asked to end as well, and keeps what it found
         process.join()
@@ -259,21 +251,13 @@ class Report(Callback):
         runs = sorted(path.parents[1] for path in folder.rglob(".hydra/overrides.yaml"))
         failed = [run for run in runs if (run / FAILED).is_file()]
         ended = sum((run / "metrics.json").is_file() for run in runs if run not in failed)
-        try:
-            if ended:
-                print()
-                from lfrtorch.cli import compare  # pandas takes its time, and one run has no table
-
-                with user_errors():
-                    compare.run([folder])
-        finally:  # Hydra would make a warning of an error, and exit with 0
-            print(f"\n{ended} of {len(runs)} runs in {folder} are done")
-            if failed:
-                why = [(run / FAILED).read_text(encoding="utf-8").strip() for run in failed]
-                names = [str(run.relative_to(folder)) for run in failed]
-                rows = [list(pair) for pair in zip(names, why, strict=True)]
-                print(f"\n{tables.table(['failed', 'why'], rows)}")
-                sys.exit(1)
+        print(f"\n{ended} of {len(runs)} runs in {folder} are done")
+        if failed:
+            why = [(run / FAILED).read_text(encoding="utf-8").strip() for run in failed]
+            names = [str(run.relative_to(folder)) for run in failed]
+            rows = [list(pair) for pair in zip(names, why, strict=True)]
+            print(f"\n{tables.table(['failed', 'why'], rows)}")
+            sys.exit(1)
 
 
 def went_on(launched: Callable[[], Any]) -> None:

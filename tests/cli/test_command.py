@@ -26,7 +26,6 @@ print("loaded", *sorted({name.split(".")[0] for name in sys.modules}))
 HELP = {
     "preview": "PATH path= inputs= outputs= fs= time= test= out=",
     "linear": "data.path= nx=auto bla.refine= frf.method= +bench= linear.json",
-    "compare": "FOLDER out= +bench= data=file",
     "evaluate": "checkpoint= out= overwrite=true +bench= data=file effect",
     "simulate": "checkpoint= data.path= data.inputs= data.outputs= data.time= data.fs= start= "
     "estimate= x0= skip= out= format= overwrite=",
@@ -82,7 +81,7 @@ def test_help_comes_without_what_computes():
         [sys.executable, "-c", ALL_HELP], capture_output=True, text=True, check=True
     )
     text, loaded = done.stdout.rsplit("loaded", 1)
-    assert text.count("data.path") >= len(command.COMMANDS) - 2  # but export and compare
+    assert text.count("data.path") >= len(command.COMMANDS) - 1  # but export
     assert {"torch", "numba", "scipy", "numpy", "pandas", "matplotlib"}.isdisjoint(loaded.split())
 
 

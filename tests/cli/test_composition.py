@@ -139,7 +139,6 @@ WHOLE = [*FILE, "data.inputs=[force]", "data.outputs=[disp]", "data.fs=750", "nx
         ("simulate", "checkpoint=m x.csv inputs=0", ["checkpoint=m", FILE[1], *INPUTS]),
         ("preview", "x.csv y.mat.csv", [FILE[0], "data.path=[x.csv,y.mat.csv]"]),
         ("config", "runs/*.mat test=sweep.csv", [*PATTERN, "data.test=sweep.csv"]),
-        ("compare", "folders=runs/a path=x.csv", ["folders=runs/a", *FILE]),
         ("config", "x.csv inputs=null", [*FILE, "data.inputs=null"]),
         ("config", "x.csv reference=r,'s,t'", [*FILE, "data.reference=[r,'s,t']"]),
         ("config", "+bench=boucwen seed=1", ["+bench=boucwen", "seed=1"]),
