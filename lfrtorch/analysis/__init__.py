@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from lfrtorch._support.arguments import typed
-from lfrtorch.analysis.bounds import Bound, bound
 from lfrtorch.analysis.canonical_form import Canonical, canonical
 from lfrtorch.analysis.confidence_bands import Band, Uncertainty, spread, uncertainty
-from lfrtorch.analysis.contraction import Contraction, contraction
 from lfrtorch.analysis.linear_bands import PoleBand, ResponseBand, pole_bands, response_band
 from lfrtorch.analysis.linearisation import linearise
 from lfrtorch.analysis.lpv_form import LPV, lpv
@@ -21,6 +20,8 @@ from lfrtorch.records import Record
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from lfrtorch.guarantees import Bound, Contraction, bound, contraction
 
 __all__ = [
     "LPV",
@@ -48,6 +49,13 @@ __all__ = [
     "trim",
     "uncertainty",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the room of proofs with the first use of one of them."""
+    if name not in ("Bound", "Contraction", "bound", "contraction"):
+        raise AttributeError(name)
+    return getattr(import_module("lfrtorch.guarantees"), name)
 
 
 @typed()

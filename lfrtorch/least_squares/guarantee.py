@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Literal, Protocol
 
 import torch
@@ -11,7 +12,6 @@ from torch import Tensor
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.least_squares.box import Box, bounds_of
-from lfrtorch.least_squares.contracting import Contracting
 from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.least_squares.linear_systems import System
 from lfrtorch.least_squares.stable_states import Stable
@@ -35,10 +35,9 @@ class Guarantee(Protocol):
 
 def guarantee_of(name: Name | None, cell: LFRCell, samples: int, ranks: Ranks) -> Guarantee | None:
     """The guarantee of a name; None if there is none, or nothing that could break it."""
-    if name == "contracting":
-        return Contracting(cell)
-    if isinstance(name, float):
-        return Contracting(cell, name)
+    if name == "contracting" or isinstance(name, float):
+        contracting = import_module("lfrtorch.guarantees.contracting").Contracting
+        return contracting(cell, name) if isinstance(name, float) else contracting(cell)
     bounds = bounds_of(cell)
     if name is None and torch.isfinite(bounds).any():
         return Box(bounds)

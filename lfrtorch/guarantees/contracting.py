@@ -20,8 +20,7 @@ from torch import Tensor
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.least_squares.bounded_system import BoundedSystem
-from lfrtorch.least_squares.certificate import (
+from lfrtorch.guarantees.certificate import (
     SLOWEST,
     Certificate,
     Differences,
@@ -32,6 +31,7 @@ from lfrtorch.least_squares.certificate import (
     prepared,
     returned,
 )
+from lfrtorch.least_squares.bounded_system import BoundedSystem
 from lfrtorch.least_squares.linear_systems import System
 from lfrtorch.maps.enclosure import Enclosure, everywhere
 

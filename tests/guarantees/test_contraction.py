@@ -11,7 +11,7 @@ from reference import frf, measure, polynomial_cell, random_cell, random_model
 
 from lfrtorch import Channel, analysis
 from lfrtorch._support.types import Array
-from lfrtorch.analysis.contraction import Contraction
+from lfrtorch.analysis import Contraction
 from lfrtorch.maps.network import Network
 from lfrtorch.model import Model
 from lfrtorch.records import Record

@@ -16,13 +16,13 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import factor_of, number
 from lfrtorch._support.types import Array
-from lfrtorch.analysis.bounds import amplitudes, reach
 from lfrtorch.analysis.linearisation import levels_of
 from lfrtorch.data_reach import Cloud, DataReach
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import linearise, spectral_radius
 from lfrtorch.engine.operating_point import double
-from lfrtorch.least_squares.certificate import (
+from lfrtorch.guarantees.bounds import amplitudes, reach
+from lfrtorch.guarantees.certificate import (
     SLOWEST,
     Certificate,
     Differences,

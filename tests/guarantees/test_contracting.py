@@ -9,9 +9,9 @@ from reference import measure, normal, polynomial_cell, random_cell, random_mode
 
 from lfrtorch import analysis
 from lfrtorch.fitting.multistart import fit
+from lfrtorch.guarantees.contracting import Contracting, MarginBound
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.bounded_system import BoundedSystem
-from lfrtorch.least_squares.contracting import Contracting, MarginBound
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import CholeskySystem
 from lfrtorch.least_squares.problem import Problem

@@ -93,7 +93,7 @@ def bound(model: Model, amplitude: ArrayLike, *, x0: ArrayLike | None = None) ->
     """What the states and outputs of a model stay within, whatever the input of an amplitude.
 
     It is reached by the worst input of a linear model, and may be far from that of a nonlinear one.
-    The mathematics stand at the head of ``lfrtorch/analysis/bounds.py``.
+    The mathematics stand at the head of ``lfrtorch/guarantees/bounds.py``.
 
     Args:
         model: with a stable A, and a network of tanh, sigmoid or rbf; or linear.

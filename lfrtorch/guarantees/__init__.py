@@ -1,0 +1,10 @@
+"""Proofs about a model: that it contracts, and bounds of its signals.
+
+No other room imports this one: a fit loads it for ``guarantee="contracting"``, and ``analysis``
+with the first use. Certificates need clarabel: pip install 'lfrtorch[certificate]'.
+"""
+
+from lfrtorch.guarantees.bounds import Bound, bound
+from lfrtorch.guarantees.contraction import Contraction, contraction
+
+__all__ = ["Bound", "Contraction", "bound", "contraction"]
