@@ -22,11 +22,12 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.reasons import Reason
-from lfrtorch.cli import CONF, study
+from lfrtorch.cli import CONF, sweep
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import configured, limit_threads, loaded
 from lfrtorch.cli.errors import user_errors
@@ -163,11 +164,11 @@ def main(cfg: DictConfig) -> float:
     """The command line."""
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
-    if study.of_several(job):
-        command = shlex.join(["lfrtorch", "fit", *job.overrides.task])
-        work = partial(launched, folder=folder, command=command)
-        return study.job(work, cfg, folder, hydra=job)
+    cfg.threads = sweep.threads(job, cfg.threads)
     command = shlex.join([*program("train.py"), *job.overrides.task])
+    if job.mode == RunMode.MULTIRUN:
+        work = partial(launched, cfg, folder, command)
+        return sweep.one_of_several(work, folder, overwrite=cfg.overwrite is True)
     return launched(cfg, folder, command)
 
 
@@ -188,16 +189,16 @@ def launched(cfg: DictConfig, folder: Path, command: str) -> float:
 
 def launch() -> None:
     """``main``; of several processes the first alone has Hydra write files."""
-    if world() > 1 and study.is_study(sys.argv):
+    several = sweep.asked(sys.argv)
+    if world() > 1 and several:
         sys.exit("error: torchrun shares one fit; start several runs one after another.")
     with user_errors(os.environ.get("RANK", "0")):
-        several = study.is_study(sys.argv)
-        take_words("config", study.study_words if several else arguments)
+        take_words("config", sweep.words_of_runs if several else arguments)
     if world() > 1 and os.environ["RANK"] != "0":
         # Settings of Hydra for all processes but the first.
         sys.argv += ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none"]
     if several:
-        with user_errors():  # Ctrl-C and SIGTERM reach the runs
-            study.went_on(main)
+        with user_errors():
+            sweep.launched(main)
     else:
         main()
