@@ -127,7 +127,7 @@ def estimated_start(
     known: Booleans = np.asarray(moments[:, -1] > 0.0)
     moments = np.where(known[:, None], np.maximum(moments, _FLAT * moments[:, -1:]), 1.0)
     deviations = np.sqrt(moments)[:, None]
-    white = (axes / deviations).swapaxes(1, 2) * known[:, None, None]
+    white = np.ascontiguousarray((axes / deviations).swapaxes(1, 2)) * known[:, None, None]
     # Nothing after the last sample with a weight tells the state.
     last = 1 + int(np.flatnonzero(factors.any(axis=(0, 2))).max(initial=0))
     whole, u, y, weight = u, u[:, :last].contiguous(), y[:, :last], weight[:, :last]

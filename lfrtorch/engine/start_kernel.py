@@ -6,12 +6,14 @@ trajectory and write the better ones over it. ``step_of`` is one of them, for an
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
-from lfrtorch.engine.jacobian_kernel import record_rows
-from lfrtorch.engine.simulation_kernel import simulate_record
+from lfrtorch.engine.simulation_kernel import affine, matrices, simulate_record
 from lfrtorch.engine.small_matrices import reflect, svd
+from lfrtorch.maps.machine_code import call_slope, prepared
 
 ITERATIONS, HALVINGS, TOLERANCE = 20, 6, 1e-8
 """Most Gauss-Newton steps, trials in a step, and the relative decrease that ends the search."""
@@ -27,7 +29,6 @@ PASSES = 8
 
 _MET = 4.0 * np.finfo(np.float64).eps
 _BLOCK = 256  # samples whose rows are folded at once
-_NO_ENTRIES, _NO_WEIGHTS = np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -43,31 +44,41 @@ def step_of(L, squares, x0, white, spread, variance, counted, passes, seen):
         L: (nx + 1, nx + 1), x0: (nx,), white, spread: (nx, nx).
     """
     nx, v = len(x0), variance if passes else 0.0
+    R, errors = np.empty((nx + 1, nx)), np.empty(nx + 1)
+    for i in range(nx + 1):
+        errors[i] = L[nx, i]
+        for j in range(nx):
+            R[i, j] = L[j, i]
+            errors[i] -= R[i, j] * x0[j]
     if passes > 1:
-        scaled, errors = _product(L[:nx].T, spread), L[nx] - _dot(L[:nx].T, x0)
-        U, s, _ = svd(scaled)
-        along = _dot(U.T, errors)
-        beside = max(squares - _norm(L[nx]), 0.0) + max(_norm(errors) - _norm(along), 0.0)
+        U, s, _ = svd(_product(R, spread))
+        along, left = _product_with(U.T, errors), _norm(L[nx])
+        beside = max(squares - left, 0.0) + max(_norm(errors) - _norm(along), 0.0)
         for _ in range(passes - 1):
             total = beside
             for i in range(nx):
                 if v > 0.0:
                     total += (along[i] * v / (s[i] * s[i] + v)) ** 2
             v = total / max(counted, 1)
-    whole = np.zeros((nx + 1, 2 * nx + 1))
-    prior, weighted = np.sqrt(v) * white, np.sqrt(v) * _dot(white, x0)
+    whole, root, weighted = np.zeros((nx + 1, 2 * nx + 1)), math.sqrt(v), _product_with(white, x0)
     for i in range(nx + 1):
         for j in range(nx + 1):
             whole[i, j] = L[i, j]
         for j in range(nx):
-            whole[i, nx + 1 + j] = prior[j, i] if i < nx else weighted[j]
+            whole[i, nx + 1 + j] = root * (white[j, i] if i < nx else weighted[j])
     reflect(whole, nx)
     # A state that the output does not show stays where it is.
-    U, s, V = svd(np.ascontiguousarray(whole[:nx, :nx].T))
-    along, most = -_dot(U.T, whole[nx, :nx]), s.max()
+    square = np.empty((nx, nx))
     for i in range(nx):
-        along[i] = along[i] / s[i] if s[i] > max(seen, SEEN * most) else 0.0
-    return _dot(V, along), _norm(s * along), v
+        for j in range(nx):
+            square[i, j] = whole[j, i]
+    U, s, V = svd(square)
+    along, most, promised = _product_with(U.T, whole[nx, :nx]), _largest(s), 0.0
+    for i in range(nx):
+        shown = s[i] > max(seen, SEEN * most)
+        along[i] = -along[i] / s[i] if shown else 0.0
+        promised += (s[i] * along[i]) ** 2
+    return _product_with(V, along), promised, v
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -84,67 +95,111 @@ def fit_starts(
         u: (R, T, nu), y, weight: (R, T, ny), white, spread: (R, nx, nx), variance, counted: (R,).
         x: (R, T + 1, nx), z: (R, T, nz), w: (R, T, nw), y_hat: (R, T, ny).
     """
-    trial = np.empty_like(x[0]), np.empty_like(z[0]), np.empty_like(w[0]), np.empty_like(y_hat[0])
+    nx, _, ny, nz, nw = sizes
+    T = u.shape[1]
+    trial = np.empty((T + 1, nx)), np.empty((T, nz)), np.empty((T, nw)), np.empty((T, ny))
     for r in range(first, jobs, step):
-        best, own = (x[r], z[r], w[r], y_hat[r]), passes
-        seen, squares = SEEN * np.abs(weight[r]).max(), _squares(y_hat[r], y[r], weight[r])
+        best, own, largest = (x[r], z[r], w[r], y_hat[r]), passes, 0.0
+        for k in range(T):
+            largest = max(largest, _largest(weight[r, k]))
+        seen, squares = SEEN * largest, _squares(y_hat[r], y[r], weight[r])
         for _ in range(ITERATIONS):
-            usable, L = _factor(sizes, weights, code, u[r], y[r], weight[r], best)
+            usable, L = _factor(sizes, weights, code, y[r], weight[r], best)
             if not (usable and np.isfinite(squares)):
                 break
             x0 = best[0][0].copy()
             d, promised, v = step_of(
                 L, squares, x0, white[r], spread[r], variance[r], counted[r], own, seen
             )
-            before = cost = squares + v * _norm(_dot(white[r], x0))
+            before = cost = squares + v * _norm(_product_with(white[r], x0))
             # A step that should hardly lower the cost is not worth a trial.
             for _ in range(HALVINGS if promised > TOLERANCE * cost else 0):
-                for n in range(4):
-                    trial[n][:] = best[n]
-                trial[0][0] = x0 + d
+                _copy(best, trial)
+                for i in range(nx):
+                    trial[0][0, i] = x0[i] + d[i]
                 simulate_record(
                     sizes, weights, code, u[r], _MET, trial[0], trial[1], trial[2], trial[3]
                 )
                 reached = _squares(trial[3], y[r], weight[r])
-                total = reached + v * _norm(_dot(white[r], trial[0][0]))
+                total = reached + v * _norm(_product_with(white[r], trial[0][0]))
                 if total < cost:  # False for NaN
-                    for n in range(4):
-                        best[n][:] = trial[n]
+                    _copy(trial, best)
                     squares, cost = reached, total
                     break
-                d = d / 4.0
+                for i in range(nx):
+                    d[i] /= 4.0
             if (own in (0, PASSES)) and not cost < (1.0 - TOLERANCE) * before:
                 break
             own = min(2 * own, PASSES)
 
 
 @njit(nogil=True, error_model="numpy")
-def _factor(sizes, weights, code, u, y, weight, at):
+def _factor(sizes, weights, code, y, weight, at):
     """Whether M = [derivative by x0 | errors], weighted, is finite, and L with L Lᵀ = Mᵀ M."""
-    (T, ny), nx = y.shape, sizes[0]
-    x, z, w, y_hat = at
-    S, L = np.eye(nx), np.zeros((nx + 1, nx + 1))
+    A, _, Bw, Cz, _, Cy, _, Dyw, phi = matrices(sizes, weights)
+    (nx, nw), nz, (T, ny) = Bw.shape, len(Cz), y.shape
+    slope, ints, constants, room = code[2], code[3], code[4], prepared(code, phi)
+    S, L, J = np.eye(nx), np.zeros((nx + 1, nx + 1)), np.zeros((nw, nz))  # S[j] is ∂x/∂x0[j]
+    none, nothing = np.empty(0), np.empty((max(nw, nz), 0))
+    dx, dz, dw, dy = np.empty(nx), np.empty(nz), np.empty(nw), np.empty(ny)
     for t0 in range(0, T, _BLOCK):
         B = min(_BLOCK, T - t0)
-        rows, stacked = np.empty((B, ny, nx)), np.zeros((nx + 1, nx + 1 + B * ny))
-        record_rows(
-            sizes, weights, code, u, x, z, w, t0, _NO_ENTRIES, _NO_ENTRIES, _NO_ENTRIES,
-            _NO_WEIGHTS, 0, nx, S, rows,
-        )  # fmt: skip
-        stacked[:, : nx + 1] = L
-        for k in range(B):
+        stacked, finite = np.zeros((nx + 1, nx + 1 + B * ny)), True
+        _into(L, stacked)
+        for k in range(t0, t0 + B):
+            if nw:
+                call_slope(slope, ints, constants, phi, at[1][k], J, none, 0, room)
+            first = nx + 1 + (k - t0) * ny
+            for j in range(nx):
+                affine(Cz, S[j], nothing, none, dz)
+                affine(J, dz, nothing, none, dw)
+                affine(Cy, S[j], Dyw, dw, dy)
+                affine(A, S[j], Bw, dw, dx)
+                for i in range(nx):
+                    S[j, i] = dx[i]
+                for i in range(ny):
+                    stacked[j, first + i] = weight[k, i] * dy[i]
+                    finite = finite and math.isfinite(stacked[j, first + i])
             for i in range(ny):
-                column = nx + 1 + k * ny + i
-                for j in range(nx):
-                    stacked[j, column] = weight[t0 + k, i] * rows[k, i, j]
-                stacked[nx, column] = weight[t0 + k, i] * (y_hat[t0 + k, i] - y[t0 + k, i])
-        if not np.isfinite(stacked).all():
+                stacked[nx, first + i] = weight[k, i] * (at[3][k, i] - y[k, i])
+                finite = finite and math.isfinite(stacked[nx, first + i])
+        if not finite:
             return False, L
         reflect(stacked, nx + 1)
-        L = stacked[:, : nx + 1].copy()
-        if np.abs(S).max() < FADED:
+        _into(stacked, L)
+        faded = True
+        for j in range(nx):
+            for i in range(nx):
+                faded = faded and abs(S[j, i]) < FADED  # False for NaN
+        if faded:
             break
     return True, L
+
+
+# Loops for slices and expressions of arrays, which take numba seconds to compile.
+
+
+@njit(nogil=True)
+def _into(source, target):
+    """Write the columns that both have."""
+    for i in range(len(source)):
+        for j in range(min(source.shape[1], target.shape[1])):
+            target[i, j] = source[i, j]
+
+
+@njit(nogil=True)
+def _copy(source, target):
+    """Write the signals of a trajectory over those of another."""
+    for n in range(4):
+        _into(source[n], target[n])
+
+
+@njit(nogil=True)
+def _largest(v):
+    most = 0.0
+    for i in range(len(v)):
+        most = max(most, abs(v[i]))
+    return most
 
 
 @njit(nogil=True, error_model="numpy")
@@ -165,7 +220,7 @@ def _norm(v):
 
 
 @njit(nogil=True, error_model="numpy")
-def _dot(M, v):
+def _product_with(M, v):
     out = np.zeros(len(M))
     for i in range(len(M)):
         for j in range(len(v)):
