@@ -26,7 +26,7 @@ def test_singular_values_and_vectors(sizes: tuple[int, int], missing: int, scale
     m, n = sizes
     M = matrix(m, n, max(0, n - missing), scale, seed)
     U, s, V = svd(M)
-    norm = np.linalg.norm(M)
+    norm = float(np.linalg.norm(M))
     # Each rotation rounds: a few times eps, relative to the largest singular value.
     np.testing.assert_allclose(U * s @ V.T, M, rtol=0, atol=1e-13 * norm)
     np.testing.assert_allclose(np.sort(s)[::-1], np.linalg.svd(M)[1], rtol=0, atol=1e-13 * norm)
