@@ -21,11 +21,25 @@ def main(folders: list[str]) -> None:
     files = sorted({file for folder in folders for file in Path(folder).rglob("metrics.json")})
     if not files:
         sys.exit("error: no run came to its end there; give folders with metrics.json.")
-    runs = [(file.parent, json.loads(file.read_text(encoding="utf-8"))) for file in files]
+    runs = [(file.parent, read(file)) for file in files]
     root = os.path.commonpath([folder.parent for folder, _ in runs])
     for bench in dict.fromkeys(run["bench"] for _, run in runs):
         own = [(os.path.relpath(f, root), run) for f, run in runs if run["bench"] == bench]
-        print(f"{bench}\n\n{table(*rows(own))}\n")
+        units = {score["unit"] for _, run in own for score in run["scores"].values()}
+        unit = units.pop() if len(units) == 1 else ""
+        unit = f" ({unit})" if unit and "," not in unit else ""  # of several it is relative
+        print(f"{bench}: RMSE{unit}\n\n{table(*rows(own))}\n")
+
+
+def read(file: Path) -> dict[str, Any]:
+    """What a run wrote of itself; other files end the program with a message."""
+    try:
+        run = json.loads(file.read_text(encoding="utf-8"))
+        if not {"bench", "validation", "scores", "fit", "parameters_net"} <= run.keys():
+            raise ValueError
+    except (OSError, ValueError, AttributeError):
+        sys.exit(f"error: '{file}' is not of a run; leave its folder out, or move it away.")
+    return run
 
 
 def rows(runs: list[tuple[str, dict[str, Any]]]) -> tuple[list[str], list[list[Cell]]]:

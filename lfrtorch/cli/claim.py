@@ -24,7 +24,7 @@ _locks: dict[Path, int] = {}
 
 
 class Claim(Callback):
-    """Hydra calls it before it makes the folder of one run; studies keep theirs themselves."""
+    """Hydra calls it before it makes the folder of one run, but not of several (``sweep``)."""
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         """Claim ``hydra.run.dir``."""

@@ -23,7 +23,6 @@ from lfrtorch.cli.wording import as_words
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.fitting.settings import Settings
-from lfrtorch.records import Record
 from lfrtorch.survey.notes import notes_on
 
 
@@ -104,13 +103,6 @@ def loaded(cfg: DictConfig) -> Dataset:
     for note in notes:
         print(in_lines(f"note: {note}"))
     return replace(dataset, notes=notes)
-
-
-def one_record(cfg: DictConfig) -> Record | None:
-    """A record for several models to simulate: the first of validation, or else of the tests."""
-    require_data(cfg)
-    dataset: Dataset = instantiate(cfg.data)
-    return next(iter((*dataset.validation, *dataset.tests)), None)
 
 
 def require_data(cfg: DictConfig) -> None:

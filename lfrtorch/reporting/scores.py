@@ -261,13 +261,6 @@ def own_linear(result: Mapping[str, Any]) -> str:
     return f"linear: a model for each of these: {', '.join(models)}"
 
 
-def unit_of(result: Mapping[str, Any]) -> str:
-    """The unit of all errors in what :func:`metrics` returns; none if there are several."""
-    listed = [*result["scores"].values(), *result["validation"]["records"].values()]
-    units = {joint_unit(s) for s in listed} - {""}
-    return units.pop() if len(units) == 1 else ""
-
-
 def static_map(sizes: Mapping[str, int], known_states: int = 0) -> str:
     """The sizes in words."""
     if known_states:
