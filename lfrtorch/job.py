@@ -166,8 +166,7 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
         check_channels(settings.init_from, dataset.train[0])
     if settings.fixed:
         nu, ny = len(dataset.train[0].inputs), len(dataset.train[0].outputs)
-        nx, nz, nw = (cast(int, size) for size in (settings.nx, settings.nz, settings.nw))
-        checked(settings.fixed, shapes(nx, nu, ny, nz, nw))
+        checked(settings.fixed, shapes(settings.states, nu, ny, settings.nz, settings.nw))
     dataset = dataset.with_windows()
     stage = replace(given, dataset=dataset)
     linearly = of_linear_model(settings)
@@ -262,11 +261,6 @@ def _of_outputs(settings: Settings, dataset: Dataset) -> Settings:
         raise InputError(
             f"{', '.join(settings.searched)}: auto, and sizes are not searched with "
             "start='measured' yet; give numbers."
-        )
-    if settings.structure != "free":
-        raise InputError(
-            f"structure is {settings.structure!r}, and with start='measured' the outputs are the "
-            "states, which no structure has; give structure='free', or start='estimated'."
         )
     if settings.known_states or settings.nx == ny:
         return settings
@@ -502,7 +496,8 @@ def _choice(stage: Stage, linear: LinearModel, scan: OrderScan | None) -> Choice
         return estimate_bla(approximated, nx, **settings.linear)
 
     def start(bla: LinearModel, train: Sequence[Record], sizes: dict[str, int], seed: int) -> Model:
-        return starting_model(train, replace(settings, nx=bla.nx, **sizes), bla, seed)
+        begun = starting_model(train, replace(settings, nx=bla.nx, **sizes), bla, seed)
+        return with_given(begun, settings.fixed)[0]
 
     choice = choose_sizes(
         records,
@@ -513,7 +508,7 @@ def _choice(stage: Stage, linear: LinearModel, scan: OrderScan | None) -> Choice
         ridge=0.0 if settings.ridge == "auto" else settings.ridge,
         last=settings.size_names[-1],
         seed=settings.seed,
-        guarantee=settings.trainer.guarantee,
+        guarantee="stable" if settings.trainer.guarantee == "stable" else None,
         watch=observer.say,
         ranks=stage.ranks,
         stop=stage.stop,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -22,7 +22,7 @@ from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.frames import check_index, columns_of, framed, is_frame, places_of
 from lfrtorch._support.types import Array
 from lfrtorch.data_reach import Cloud, DataReach
-from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, fixed_entries
+from lfrtorch.engine import held
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, levels, listed, system_lines
 from lfrtorch.engine.disturbance import (
@@ -31,6 +31,7 @@ from lfrtorch.engine.disturbance import (
     drift_variance,
     tells_apart,
 )
+from lfrtorch.engine.gauge_directions import free_directions
 from lfrtorch.engine.initial_state import estimated_start, measured_start
 from lfrtorch.engine.innovation import predictor_cell, split_predictor
 from lfrtorch.engine.lfr import LFR
@@ -45,6 +46,7 @@ from lfrtorch.extended_kalman_filter import (
     with_variances,
 )
 from lfrtorch.maps.descriptions import foreign, made
+from lfrtorch.maps.static_map import StaticMap
 from lfrtorch.records import (
     Channel,
     NormalisedRecord,
@@ -275,10 +277,10 @@ class Model:
 
     @property
     def parameter_count(self) -> int:
-        """Number of parameters P; entries that are given, and feedthrough held at 0, are none."""
-        fixed = fixed_entries(self.lfr.cell)
-        free = [(name, p) for name, p in self.lfr.cell.named_parameters() if not _zero(p)]
-        return sum(p.numel() - int(fixed[n].sum() if n in fixed else 0) for n, p in free)
+        """Number of parameters P; entries that a fit holds are none."""
+        cell = self.lfr.cell
+        held = sum(int(mask.sum()) for mask in cell.held.values())
+        return sum(p.numel() for p in cell.parameters()) - held
 
     @property
     def net_parameter_count(self) -> int:
@@ -286,25 +288,21 @@ class Model:
 
         nx² for the coordinates of x, nz² and nw² for those of z and w (a network and a polynomial
         absorb them), max(0, nw - ny) for a constant w that hides in the origin of the state, and
-        nz nw for the linear terms of a polynomial, which A, Bu, Cy and Dyu hold as well. States in
-        two halves have coordinates of their own, and branches scales alone; an entry that is given
-        takes one direction of x. Where only n < nz
-        signals enter z (the inputs, or the states without feedthrough), the map is one of n.
+        nz nw for the linear terms of a polynomial, which A, Bu, Cy and Dyu hold as well. Entries
+        that a fit holds leave fewer coordinates. Where only n < nz signals enter z (the inputs, or
+        the states without feedthrough), the map is one of n.
         """
         cell = self.lfr.cell
-        halves = 2 if cell.structure in IN_SERIES else 1
-        z_free, y_free = not _zero(cell.Dzu), not _zero(cell.Dyu)
-        predicting = cell.past_outputs * (cell.nz * z_free + cell.ny * y_free)  # its zeros
-        given = sum(int(m.sum()) for n, m in cell.fixed.items() if n not in ("Dzu", "Dyu", "Dyw"))
-        gauge = max(0, cell.nx**2 // halves - given) + predicting
-        if cell.structure == "parallel":
-            return self.parameter_count - gauge - cell.nz - cell.nw
-        if self.known_states:  # its matrices are given
-            learned = cell.map.learned
-            return self.parameter_count - self.sizes["nx"] ** 2 - learned.redundant(learned.nz)
-        fed = cell.nx // halves * (cell.structure != "hammerstein")
-        fed += (cell.nu - cell.past_outputs) * z_free
-        return self.parameter_count - gauge - cell.map.redundant(fed, cell.ny)
+        shapes = {"Cz": (cell.nz, cell.nx), "Dzu": (cell.nz, cell.nu)}
+        none = {name: torch.zeros(shape, dtype=torch.bool) for name, shape in shapes.items()}
+        first_z = 0 if cell.map.known is None else cell.map.known.nz
+        fed = sum(
+            int((~cell.held.get(name, none[name])[first_z:]).any(dim=0).sum()) for name in none
+        )
+        learned = cell.map.learned
+        beside = cell.ny if cell.map.known is None else None
+        hidden = learned.redundant(fed, beside) - StaticMap.redundant(learned, fed)
+        return self.parameter_count - free_directions(cell) - hidden
 
     @typed("data")
     def simulate(
@@ -760,16 +758,10 @@ class Model:
             "inputs": [c._asdict() for c in self.inputs],
             "outputs": [c._asdict() for c in self.outputs],
         }
-        unless_usual = (
-            ("z_feedthrough", not _zero(cell.Dzu), True),
-            ("feedthrough", not _zero(cell.Dyu), True),
-            ("structure", cell.structure, "free"),
-            ("fitted_to", self.fitted_to, ""),
-        )
-        description |= {name: value for name, value, usual in unless_usual if value != usual}
+        description |= {"fitted_to": self.fitted_to} if self.fitted_to else {}
         weights = dict(self.lfr.cell.state_dict())
         weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in _SCALING}
-        weights |= {f"fixed.{name}": mask.to(cell.A) for name, mask in cell.fixed.items()}
+        weights |= {f"fixed.{name}": mask.to(cell.A) for name, mask in cell.held.items()}
         if self.K is not None:
             weights["K"] = self.K
         if self.reach is not None:
@@ -904,8 +896,10 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         static = made(own, sizes["nz"], sizes["nw"], dtype, static)
         cell = LFRCell(**sizes, static=static, dtype=dtype, random=False).to(dtype)
         K = weights.pop("K", None)
-        for name in [n for n in weights if n.startswith("fixed.")]:
-            cell.fix(name.removeprefix("fixed."), weights.pop(name) != 0)
+        masks = {
+            name.removeprefix("fixed."): weights.pop(name) != 0
+            for name in [n for n in weights if n.startswith("fixed.")]
+        }
         parts = [f"reach.{name}" for name in ("u", "y", "middle", "axes", "ends", "farthest")]
         reach = None
         if parts[0] in weights:
@@ -913,12 +907,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             reach = DataReach(of_u, of_y, Cloud(middle, axes, ends, float(far)))
         weights.setdefault("state_covariance", torch.eye(cell.nx))  # checkpoints of before
         cell.load_state_dict(weights)
-        cell.free_feedthrough(
-            z=description.get("z_feedthrough", True), y=description.get("feedthrough", True)
-        )
-        cell.structure = description.get("structure", "free")
-        if cell.structure not in STRUCTURES:
-            raise InputError(f"structure is {cell.structure!r}")
+        _hold_again(cell, masks, description)
         inputs, outputs = (described_channels(description[side]) for side in ("inputs", "outputs"))
         fitted_to = str(description.get("fitted_to", ""))
         fs = float(description["fs"])
@@ -938,9 +927,20 @@ def _inputs(record: Record) -> Array:
     return record.u
 
 
-def _zero(weight: Tensor) -> bool:
-    """Return whether a fit holds the weight at 0."""
-    return not (weight.requires_grad or weight.any())
+def _hold_again(cell: LFRCell, masks: Mapping[str, Tensor], description: Mapping[str, Any]) -> None:
+    """Hold the entries of a checkpoint; those of before name some of them in the description."""
+    named = description.get("structure", "free")
+    if named not in held.STRUCTURES:
+        raise InputError(f"structure is {named!r}")
+    for given in (
+        {name: (mask, cell.get_parameter(name).detach()) for name, mask in masks.items()},
+        held.structure(cell, named),
+        held.no_feedthrough(
+            cell, z=description.get("z_feedthrough", True), y=description.get("feedthrough", True)
+        ),
+        held.integrators(cell),
+    ):
+        cell.hold(given)
 
 
 def check_channels(model: Model, record: Record) -> None:

@@ -458,7 +458,6 @@ def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFi
         ({"degree": "auto"}, "degree is auto, and this static map has none; give nn='auto'"),
         ({"static": "spline"}, "static is 'spline'"),
         ({"static": -1}, "static is -1"),
-        ({"static": torch.nn.Linear, "nz": "auto"}, "is not searched; give numbers"),
         ({"init": "magic"}, "init is 'magic'"),
         ({"linear": {"speed": 3}}, "linear has no option 'speed'"),
         ({"init_from": "runs/x"}, "give a model: lfrtorch.load('runs/x')"),

@@ -38,9 +38,9 @@ from lfrtorch.analysis.residual_analysis import SHORTEST, of_simulation
 from lfrtorch.analysis.static_slopes import infinite_slope
 from lfrtorch.analysis.training_reach import TrainingReach
 from lfrtorch.data_reach import FARTHEST
+from lfrtorch.engine.held import held_parameters
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.operating_point import SINGULAR, equilibrium, linearised_at
-from lfrtorch.least_squares.exact_integrators import fixed_parameters
 from lfrtorch.least_squares.gauge import reduction
 from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator
 from lfrtorch.linear.model import LinearModel
@@ -310,7 +310,7 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
     model = replace(model, lfr=LFR(cell))
     given = any(record.start == "given" for record in listed)
     none = cell.A.new_zeros(0, cell.nx)
-    kept = reduction(cell, none, coordinates=not given, fixed=fixed_parameters(cell)).kept
+    kept = reduction(cell, none, coordinates=not given, fixed=held_parameters(cell)).kept
     size = sum(record.y.size for record in listed) * (len(kept) + cell.nx)
     hold = size <= 1 << 25  # numbers in memory rather than computed again
     every = [Gradients(model, r, kept, fitted=True, hold=hold) for r in listed]

@@ -15,6 +15,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import quantity
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.analysis.trim import Trim
+from lfrtorch.engine.held import integrating_states
 from lfrtorch.engine.operating_point import (
     StateSpace,
     double,
@@ -23,7 +24,6 @@ from lfrtorch.engine.operating_point import (
     resting_input,
 )
 from lfrtorch.engine.operating_point import linear_part as linear_part_of
-from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.records import Channel

@@ -14,7 +14,7 @@ from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
-from lfrtorch.engine.weights import Layout, Weights
+from lfrtorch.engine.weights import Held, Layout, Weights
 from lfrtorch.maps.static_map import StaticMap, as_map
 
 
@@ -26,6 +26,9 @@ def check_dtype(dtype: torch.dtype) -> None:
 
 _DECAY = 0.9
 """Magnitude of all eigenvalues of a random A."""
+
+_SAME = 1e-6
+"""Relative difference of two values of an entry that are the same, in single precision, too."""
 
 
 class Matrices(NamedTuple):
@@ -110,10 +113,10 @@ class LFRCell(nn.Module):
         # Not torch.eye: on the device "meta" it imports torch's compiler, which takes a second.
         identity = torch.zeros(nx, nx, device=device, dtype=dtype).fill_diagonal_(1.0)
         self.register_buffer("state_covariance", identity)
-        self.structure = "free"
-        """Blocks that the model is made of, see ``block_form``; a fit keeps to them."""
-        self.past_outputs = 0
-        """Number of last inputs that are measured outputs; their Dzu and Dyu stay 0."""
+        self.held: dict[str, Tensor] = {}
+        """Masks of the entries that a fit holds, by the names of the parameters; see ``hold``."""
+        self.of_system: Held | None = None
+        """Entries of A, Bu and Bw that the system of a predictor holds; None of any other model."""
         self._check_shapes()
         if random and not self.A.is_meta:
             self.reset_parameters()
@@ -137,17 +140,31 @@ class LFRCell(nn.Module):
         ):
             p.normal_(std=math.sqrt(variance))
 
-    def fix(self, name: str, entries: Tensor) -> None:
-        """Let a fit leave entries of a matrix as they are: ``entries`` is a mask of its shape."""
-        if entries.shape != self.get_parameter(name).shape or entries.dtype != torch.bool:
-            raise InputError(f"a mask of {name} is of {entries.dtype} and {tuple(entries.shape)}.")
-        self.register_buffer(f"fixed_{name}", entries.to(self.A.device), persistent=False)
+    @torch.no_grad()
+    def hold(self, given: Held) -> None:
+        """Put values into entries, which every fit leaves so.
 
-    @property
-    def fixed(self) -> dict[str, Tensor]:
-        """Masks of the entries that a fit leaves as they are, by the names of the matrices."""
-        named = {name: getattr(self, f"fixed_{name}", None) for name in Matrices._fields}
-        return {name: mask for name, mask in named.items() if mask is not None}
+        Args:
+            given: masks and values by the names of the parameters, as ``engine.held`` makes them.
+
+        Raises:
+            ValueError: another value of an entry that is held already.
+        """
+        for name, (entries, values) in given.items():
+            p = self.get_parameter(name)
+            mask = entries.expand(p.shape).clone().cpu()
+            wanted, own = values.to(p).expand(p.shape), p.detach()
+            before = self.held.get(name, torch.zeros_like(mask))
+            apart = before & mask & ((own - wanted).abs() > _SAME * own.abs()).cpu()
+            if apart.any():
+                at = tuple(apart.nonzero()[0].tolist())
+                raise InputError(
+                    f"{name}{list(at)} is held at {float(own[at]):.6g}, and something else of what "
+                    f"is given holds it at {float(wanted[at]):.6g} (normalised): leave out one."
+                )
+            p[mask] = wanted[mask]
+            if mask.any():
+                self.held[name] = before | mask
 
     def forward(
         self, u: Float[Tensor, "*axes nu"], x: Float[Tensor, "*axes nx"]
@@ -280,15 +297,6 @@ class LFRCell(nn.Module):
                 f"{name} is {tensor.dtype} on {tensor.device} and the model {self.A.dtype} on "
                 f"{self.A.device}; give {name}.to({self.A.dtype}), or move the model: both alike."
             )
-
-    def free_feedthrough(self, *, z: bool, y: bool) -> None:
-        """Choose whether a fit lets the input act on z and y at once; zeros elsewhere stay zeros.
-
-        On y it acts through w, too, so without ``y`` that path is closed: at Dzu, or else at Dyw.
-        """
-        self.Dzu.requires_grad_(z)
-        self.Dyu.requires_grad_(y)
-        self.Dyw.requires_grad_(y or not z)
 
     def extra_repr(self) -> str:
         """Sizes, for ``print(module)``."""

@@ -12,7 +12,8 @@ prediction ŷ of the next output is the output of an NL-LFR whose inputs are u a
     ŷ  = Cy x + Dyu u + Dyw w
 
 Neither ŷ nor z has y at once: those columns are zeros, which a fit must leave alone. The two forms
-have the same number of parameters, and each follows from the other.
+have the same number of parameters, and each follows from the other. An entry of A, Bu or Bw that is
+held in the system is an equation between entries of the predictor and of K.
 
 References:
     Ljung, "System Identification: Theory for the User", 2nd ed., 1999, section 4.3.
@@ -25,22 +26,36 @@ from copy import deepcopy
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.held import past_outputs
+
+TIED = {"A": "Cy", "Bu": "Dyu", "Bw": "Dyw"}
+"""Matrices of the state equation, and those that K multiplies in a predictor's."""
 
 
 def predictor_cell(cell: LFRCell, K: Float[Tensor, "nx ny"]) -> LFRCell:
-    """The one-step predictor of a cell with the innovation gain K: its inputs are u, then y."""
+    """The one-step predictor of a cell with the innovation gain K: its inputs are u, then y.
+
+    What the cell holds of the other equations, so does the predictor. What it holds of A, Bu and Bw
+    is ``of_system`` there.
+    """
     with torch.no_grad():
         K = K.to(cell.A)
         found = _like(cell, cell.nu + cell.ny)
-        found.past_outputs = cell.ny
         found.A.copy_(cell.A - K @ cell.Cy)
         found.Bu.copy_(torch.cat([cell.Bu - K @ cell.Dyu, K], dim=1))
         found.Bw.copy_(cell.Bw - K @ cell.Dyw)
         for name in ("Dzu", "Dyu"):
             getattr(found, name)[:, : cell.nu] = getattr(cell, name)
-    found.free_feedthrough(z=cell.Dzu.requires_grad, y=cell.Dyu.requires_grad)
+    for name, mask in cell.held.items():
+        if name not in TIED:
+            wider = found.get_parameter(name).shape[-1] - mask.shape[-1]
+            found.held[name] = pad(mask, (0, wider))
+    found.hold(past_outputs(found))
+    own = {name: cell.get_parameter(name).detach().clone() for name in TIED}
+    found.of_system = {n: (cell.held[n], own[n]) for n in TIED if n in cell.held}
     return found
 
 
@@ -54,7 +69,11 @@ def split_predictor(cell: LFRCell) -> tuple[LFRCell, Float[Tensor, "nx ny"]]:
         found.Bw.copy_(cell.Bw + K @ cell.Dyw)
         for name in ("Dzu", "Dyu"):
             getattr(found, name).copy_(getattr(cell, name)[:, : found.nu])
-    found.free_feedthrough(z=cell.Dzu.requires_grad, y=cell.Dyu.requires_grad)
+    for name, mask in cell.held.items():
+        own = mask[:, : found.nu] if name in ("Dzu", "Dyu") else mask
+        if own.any():
+            found.held[name] = own.clone()
+    found.hold(cell.of_system or {})
     return found, K
 
 

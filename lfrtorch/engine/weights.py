@@ -6,7 +6,7 @@ it is; torch takes matrices, which are views of it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -24,6 +24,10 @@ MATRICES = {
     "Cy": ("y", "x"), "Dyu": ("y", "u"), "Dyw": ("y", "w"),
 }  # fmt: skip
 """The matrices in their order: which signal each adds to, and which it multiplies."""
+
+
+Held = Mapping[str, tuple[Tensor, Tensor]]
+"""Entries that a fit holds: masks and values by parameter, of its shape or broadcast to it."""
 
 
 class DirectTerms(NamedTuple):

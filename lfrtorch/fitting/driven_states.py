@@ -9,14 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch.nn.functional import pad
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.model import Model
+from lfrtorch.records import Record
 from lfrtorch.survey.signal import band
 
 _DAMPING = 0.03  # damping ratio of the modes
@@ -51,14 +56,38 @@ def relaxation_frequencies(
     return 0.5 * _edge(inputs) * 100.0 ** -((np.arange(count) + 0.5) / count)
 
 
-@torch.no_grad()
 def with_driven_states(
+    model: Model,
+    records: Sequence[Record],
+    relaxations: int,
+    modes: int,
+    generator: torch.Generator,
+) -> Model:
+    """A model with the same output, and states beside its own that w alone drives."""
+    if not relaxations + modes:
+        return model
+    inputs = [record.u for record in records]
+    corners = relaxation_frequencies(inputs, relaxations)
+    natural = corners[:0]
+    if modes:
+        scale = model.scaler.y_scale
+        errors = [record.errors(model.simulate(record)) / scale for record in records]
+        natural = distortion_frequencies(inputs, errors, modes)
+    cell = _larger(model.lfr.cell, corners, natural, generator)
+    K = model.K
+    if K is not None:
+        K = torch.cat([K, K.new_zeros(cell.nx - len(K), cell.ny)])
+    return replace(model, lfr=LFR(cell), K=K)
+
+
+@torch.no_grad()
+def _larger(
     cell: LFRCell,
     relaxations: Float[Array, " r"],
     modes: Float[Array, " m"],
     generator: torch.Generator,
 ) -> LFRCell:
-    """A cell with the same output, and states beside its own that w alone drives."""
+    """The cell with driven states of these frequencies."""
     # Their entries of Bw and Cy are random; those of Bu are 0, so that they are at rest as long as
     # w is 0. z sees the relaxations, a state each, and not the modes, two states each. Frequencies
     # are in rad per sample.
@@ -84,6 +113,9 @@ def with_driven_states(
     for entries in (larger.Bw[nx:], larger.Cy[:, nx:], larger.Cz[:, seen]):
         entries.uniform_(-0.3, 0.3, generator=generator)
     larger.Bw[nx:] *= gain[:, None]
+    for name, mask in cell.held.items():
+        beside = [n - m for n, m in zip(larger.get_parameter(name).shape, mask.shape, strict=True)]
+        larger.held[name] = pad(mask, (0, beside[-1], 0, beside[0]) if mask.ndim == 2 else (0, 0))
     return larger
 
 

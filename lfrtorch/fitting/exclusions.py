@@ -41,39 +41,23 @@ class Exclusion(NamedTuple):
         return bool(apart and second != USUAL[self.second])
 
 
+_PROVEN = ("contracting", float)
+
 EXCLUSIONS = (
-    *(
-        Exclusion(size, "structure", "sizes of a structure are not searched", ("auto",))
-        for size in ("nz", "nw", "nn", "degree")
-    ),
-    Exclusion("horizon", "noise", "predictions one sample ahead are not fitted in windows"),
-    Exclusion("guarantee", "noise", "it holds for the predictor, and the model could run away"),
-    Exclusion("integrators", "noise", "a predictor has no exact integrators"),
-    Exclusion("guarantee", "integrators", "no integrator contracts", ("contracting", float)),
-    Exclusion("guarantee", "static", "only slopes of networks are bounded", ("contracting", float)),
-    Exclusion("first_part", "average", "the first iterations keep one start"),
-    Exclusion("structure", "average", "a mean of models does not keep their structure"),
-    Exclusion("structure", "noise", "a predictor does not keep the structure"),
-    Exclusion("structure", "guarantee", "steps that keep the one do not keep the other"),
-    Exclusion("structure", "relaxations", "a structure has the states of its linear blocks"),
-    Exclusion("structure", "modes", "a structure has the states of its linear blocks"),
+    Exclusion("guarantee", "noise", "a predictor that is stable says nothing of its system"),
+    Exclusion("integrators", "noise", "a linear predictor finds poles near 1 without"),
+    Exclusion("guarantee", "integrators", "no integrator contracts", _PROVEN),
+    Exclusion("guarantee", "static", "only slopes of networks are bounded", _PROVEN),
+    Exclusion("structure", "relaxations", "its w drives no states", ("wiener",)),
+    Exclusion("structure", "modes", "its w drives no states", ("wiener",)),
     Exclusion("structure", "z_feedthrough", "its z is of the inputs alone", ("hammerstein",)),
     Exclusion("structure", "static", "its map is a network for each z", ("parallel",)),
-    Exclusion("known", "noise", "the gain of innovations would change what is given"),
     Exclusion("known", "guarantee", "nothing is proven of a known model"),
     Exclusion("known", "structure", "its matrices are given"),
-    Exclusion("known", "z_feedthrough", "what is learned beside it sees states and inputs"),
-    Exclusion("known", "feedthrough", "its equations say what acts on the outputs at once"),
     Exclusion("known", "relaxations", "nx is the number of states beside its own"),
     Exclusion("known", "modes", "nx is the number of states beside its own"),
-    Exclusion("known", "init", "what is learned beside it begins at zero"),
     Exclusion("known", "average", "a mean of models has no parameters of its own"),
-    Exclusion("fixed", "known", "the known model has matrices of its own"),
-    Exclusion("fixed", "noise", "the gain of innovations would change what is given"),
-    Exclusion("fixed", "structure", "a structure has zeros of its own"),
-    Exclusion("fixed", "average", "a mean of models has more states"),
-    Exclusion("guarantee", "fixed", "its certificate moves all matrices", ("contracting", float)),
-    Exclusion("fixed", "integrators", "integrators have entries of their own"),
+    Exclusion("known", "fixed", "its matrices are given"),
     Exclusion("known", "init_from", "the model brings what is known of it"),
 )
 

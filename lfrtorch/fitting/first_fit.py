@@ -18,7 +18,7 @@ from lfrtorch.records import Record, common_unit
 
 
 def begun_on_part(stage: Stage, models: list[Model]) -> tuple[Settings, list[Model]]:
-    """The best start after iterations on a part of the records, and settings with its seed."""
+    """The best start, or those of a mean, after iterations on a part of the records."""
     dataset, settings, observer = stage.dataset, stage.settings, stage.observer
     if settings.first_part == 1.0:
         return settings, models
@@ -39,6 +39,7 @@ def begun_on_part(stage: Stage, models: list[Model]) -> tuple[Settings, list[Mod
         dataset.validation,
         dataset.selection,
         monitors=None if monitor is None else [[monitor]] * len(models),
+        average=settings.average,
         **{**stage.options, "trainer": replace(trainer, max_iter=settings.first_iterations)},
     )
     if result.reason in CUT_SHORT:
@@ -52,6 +53,8 @@ def begun_on_part(stage: Stage, models: list[Model]) -> tuple[Settings, list[Mod
         f"{quantity(result.seconds, 's')}, error {quantity(chosen.train, unit)}, "
         f"seed {seed}"
     )
+    if result.members:
+        return replace(settings, starts=len(result.members)), list(result.members)
     return replace(settings, seed=seed, starts=1), [result.model]
 
 

@@ -19,6 +19,7 @@ import torch
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch._support.tables import quantity
+from lfrtorch.engine.held import measured_states
 from lfrtorch.fitting.given_entries import transformed
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.settings import Settings
@@ -68,11 +69,7 @@ def with_measured_states(model: Model) -> Model:
     with torch.no_grad():
         for name in ("A", "Bu", "Bw", "Cz"):
             cell.get_parameter(name).copy_(torch.as_tensor(found[name]))
-        cell.Cy.copy_(torch.eye(cell.nx))
-        cell.Dyu.zero_()
-        cell.Dyw.zero_()
-    for name in ("Cy", "Dyu", "Dyw"):
-        cell.fix(name, torch.ones_like(cell.get_parameter(name), dtype=torch.bool))
+    cell.hold(measured_states(cell))
     return replace(model, lfr=type(model.lfr)(cell))
 
 

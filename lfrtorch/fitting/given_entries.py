@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import Matrices
 from lfrtorch.model import Model
@@ -47,18 +48,28 @@ def with_given(model: Model, given: Given) -> tuple[Model, float]:
     Raises:
         ValueError: no such matrix, another shape, or no finite number at all.
     """
+    if not given:
+        return model, 0.0
     cell, s = deepcopy(model.lfr.cell), model.scaler
     one = np.ones(1)
     units = {
         "Bu": (one, s.u_scale), "Dzu": (one, s.u_scale), "Cy": (1 / s.y_scale, one),
         "Dyu": (1 / s.y_scale, s.u_scale), "Dyw": (1 / s.y_scale, one),
     }  # fmt: skip
-    wanted = {}
     sizes = cell.nx, cell.nu, cell.ny, cell.nz, cell.nw
+    entries = {}
     for name, matrix in checked(given, shapes(*sizes)).items():
         rows, columns = units.get(name, (one, one))
-        wanted[name] = matrix * rows[:, None] * columns
-    own = {name: p.detach().double().cpu().numpy() for name, p in cell.named_parameters()}
+        normalised = torch.as_tensor(matrix * rows[:, None] * columns)
+        entries[name] = torch.isfinite(normalised), normalised
+    before = {n: p.detach().clone() for n, p in cell.named_parameters() if n in Matrices._fields}
+    own = {name: p.double().cpu().numpy() for name, p in before.items()}
+    cell.hold(entries)
+    wanted = {
+        name: np.where(mask.numpy(), to_float64(cell.get_parameter(name)), np.nan)
+        for name, mask in cell.held.items()
+        if name in own
+    }
     T = coordinates(own, wanted)
     found, worst = transformed(own, T), 0.0
     with torch.no_grad():
@@ -71,12 +82,12 @@ def with_given(model: Model, given: Given) -> tuple[Model, float]:
             size = max(np.abs(found[name]).max(), np.abs(matrix[mask]).max()) or 1.0
             worst = max(worst, float(np.abs(found[name] - matrix)[mask].max() / size))
             p[torch.as_tensor(mask)] = torch.as_tensor(matrix[mask]).to(p)
-            cell.fix(name, torch.as_tensor(mask))
-    return replace(model, lfr=type(model.lfr)(cell)), worst
+    K = None if model.K is None else moved.to(model.K) @ model.K
+    return replace(model, lfr=type(model.lfr)(cell), K=K), worst
 
 
-def shapes(nx: int, nu: int, ny: int, nz: int, nw: int) -> dict[str, tuple[int, int]]:
-    """Shapes of the matrices."""
+def shapes(nx: Any, nu: int, ny: int, nz: Any, nw: Any) -> dict[str, tuple[Any, Any]]:
+    """Shapes of the matrices; a size that is not chosen yet is ``"auto"``."""
     into, of = {"A": nx, "Bu": nu, "Bw": nw}, {"Cz": nz, "Cy": ny}
     found = {name: (nx, size) for name, size in into.items()}
     found |= {name: (size, nx) for name, size in of.items()}
@@ -93,9 +104,10 @@ def checked(given: Given, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Ar
             )
         matrix = reals(f"fixed {name}", value)
         if matrix.shape != shapes[name]:
+            auto = "; give a number for what is auto" if "auto" in shapes[name] else ""
             raise InputError(
                 f"fixed {name} has the shape {matrix.shape}; the model's has {shapes[name]}, with "
-                "NaN for entries that are free."
+                f"NaN for entries that are free{auto}."
             )
         if np.isinf(matrix).any() or not np.isfinite(matrix).any():
             raise InputError(

@@ -16,10 +16,12 @@ from typing import Any, cast
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch._support.tables import number, quantity
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.held import no_feedthrough
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.fitting.driven_states import relaxation_frequencies
 from lfrtorch.fitting.from_outputs import begins_at_outputs, begun_on_short_windows, in_windows
@@ -33,8 +35,7 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.direct_sum import DirectSum
 from lfrtorch.maps.known_map import KnownModel
 from lfrtorch.maps.network import Network
-from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.maps.static_map import StaticMap
+from lfrtorch.maps.static_map import StaticMap, as_map
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler, common_unit, rms_scale
 
@@ -117,8 +118,7 @@ def around(
         "Dyu": torch.ones(ny, nu, dtype=torch.bool),
         "Dyw": (own_w | y_alone).expand(ny, -1),
     }
-    for name, mask in given.items():
-        cell.fix(name, mask.clone())
+    cell.hold({name: (mask, cell.get_parameter(name).detach()) for name, mask in given.items()})
     return cell
 
 
@@ -129,11 +129,13 @@ def with_learned(model: Model, records: Sequence[Record], settings: Settings, se
     generator = torch.Generator().manual_seed(seed)
     learned = learned_map(settings, generator)
     cell = around(static, known, old.nu, old.ny, learned=learned, states=states)
+    cell.hold(no_feedthrough(cell, z=settings.z_feedthrough, y=settings.feedthrough))
 
     def uniform(name: str, part: Any, limit: float = 1.0) -> None:
         entries = cell.get_parameter(name)[part]
         entries.uniform_(-limit, limit, generator=generator)
-        entries.masked_fill_(cell.fixed[name][part], 0.0)
+        if name in cell.held:
+            entries.masked_fill_(cell.held[name][part], 0.0)
 
     with torch.no_grad():
         found = [model.signals(record) for record in records]
@@ -154,17 +156,19 @@ def with_learned(model: Model, records: Sequence[Record], settings: Settings, se
             rms = torch.where(torch.isfinite(rms), rms, 1.0)
             cell.Cz[own_z] /= rms[:, None]
             cell.Dzu[own_z] /= rms[:, None]
-            uniform("Bw", (slice(None), own_w), _REACH)
-            uniform("Dyw", (slice(None), own_w), _REACH)
-            learned.zero_output()
-    return replace(model, lfr=LFR(cell))
+            if settings.init == "zero_output":
+                uniform("Bw", (slice(None), own_w), _REACH)
+                uniform("Dyw", (slice(None), own_w), _REACH)
+                learned.zero_output()
+    K = None if model.K is None else pad(model.K, (0, 0, 0, states))
+    return replace(model, lfr=LFR(cell), K=K)
 
 
 def learned_map(settings: Settings, generator: torch.Generator) -> StaticMap | None:
     """The map that is learned beside a known model; None if none is asked for."""
     nz, nw, nn = (cast(int, size) for size in (settings.nz, settings.nw, settings.nn))
-    if settings.static == "polynomial":
-        return Polynomial(nz, nw, cast(int, settings.degree), dtype=torch.float64)
+    if settings.static != "network":
+        return as_map(settings.static_map()["static"].to(torch.float64), nz, nw)
     if nn == 0:
         return None
     found = Network(nz, nw, nn, settings.activation, dtype=torch.float64)
@@ -199,6 +203,8 @@ def known_starts(stage: Stage, linear: LinearModel) -> tuple[Settings, list[Mode
         settings = replace(settings, known=known)
     records = in_windows(stage)
     model = known_model(known, linear, records)
+    if settings.noise != "output":  # the search begins at the simulation, with no innovations
+        model = replace(model, K=model.lfr.cell.A.new_zeros(model.lfr.cell.nx, len(model.outputs)))
     if known.outputs is None and len(model.outputs) > 1:
         pairs = zip(model.outputs, known.observed([y.name for y in model.outputs]), strict=True)
         observer.say(f"known model: {', '.join(f'{y.name} is {state}' for y, state in pairs)}")

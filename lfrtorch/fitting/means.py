@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from torch.nn import Module
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
-from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.cell import LFRCell, Matrices
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.maps.direct_sum import DirectSum
 from lfrtorch.model import Model
@@ -74,9 +74,7 @@ def mean_model(models: Sequence[Model]) -> Model:
         cell.Cy.copy_(beside(lambda c: c.Cy))
         cell.Dyw.copy_(beside(lambda c: c.Dyw))
         cell.Dyu.copy_(torch.stack([c.Dyu for c in cells]).mean(dim=0))
-    cell.free_feedthrough(
-        z=any(c.Dzu.requires_grad for c in cells), y=any(c.Dyu.requires_grad for c in cells)
-    )
+    cell.held = _held_beside(cells, dict(cell.named_parameters()))
     return replace(first, lfr=LFR(cell), K=None)  # gains of models do not make one of their mean
 
 
@@ -88,6 +86,30 @@ def _beside(cells: Sequence[LFRCell]) -> Module | None:
     first, *others = (cell.map for cell in cells)
     parts = [deepcopy(cell.static) for cell in cells if cell.static is not None]
     return first.beside(others) or DirectSum(parts, [(cell.nz, cell.nw) for cell in cells])
+
+
+def _held_beside(cells: Sequence[LFRCell], whole: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Masks of the mean of cells; zeros between two blocks are held as the blocks themselves are.
+
+    Otherwise a fit of the mean would lead w of one model to z of another past a structure.
+    """
+    found = {}
+    for name in {name for cell in cells for name in cell.held if name in whole}:
+        masks = [
+            cell.held.get(name, torch.zeros(cell.get_parameter(name).shape, dtype=torch.bool))
+            for cell in cells
+        ]
+        if name == "Dyu":
+            found[name] = torch.stack(masks).all(dim=0)
+        elif name in ("Bu", "Dzu"):
+            found[name] = torch.cat(masks)
+        elif name in ("Cy", "Dyw"):
+            found[name] = torch.cat(masks, dim=1)
+        elif name in Matrices._fields and len({mask.shape for mask in masks}) == 1:
+            found[name] = torch.stack(masks).any(dim=0).repeat(len(cells), len(cells))
+        else:
+            found[name] = ~torch.block_diag(*(~mask for mask in masks))
+    return {name: mask for name, mask in found.items() if mask.shape == whole[name].shape}
 
 
 def _alike(one: Model, other: Model) -> bool:

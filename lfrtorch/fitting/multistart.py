@@ -300,7 +300,7 @@ def _fitted(
                 kept, _ = planned[number]
                 snapshots.decided([judge.numbers[id(fit)] for fit in field[:kept]])
                 field = _drop_others(field, field[:kept])
-    if len(fits) > 1 and options["horizon"] is None and not begun.lfr.cell.past_outputs:
+    if len(fits) > 1 and options["horizon"] is None and begun.lfr.cell.of_system is None:
         judge.refuse_what_remembers(field, train, begun)
     ranked = judge.ranked(fits)
     result = ranked[0].result()
@@ -334,8 +334,7 @@ def _check(starts: Sequence[Model], watching: Sequence[Sequence[Monitor]], avera
         )
     integer("average", average, 1)
     for model in starts:
-        known = "given" if model.known_states else None
-        refuse_together(average=average, structure=model.lfr.cell.structure, known=known)
+        refuse_together(average=average, known="given" if model.known_states else None)
 
 
 def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]:

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.trainer import Monitor
-from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, with_past_outputs
 
@@ -25,9 +23,6 @@ def predicting(
 ) -> tuple[Model | list[Model], *tuple[list[Record], ...]]:
     """The predictors of models, and the records that drive them."""
     given = [models] if isinstance(models, Model) else list(models)
-    for model in given:
-        count = int(integrating_states(model.lfr.cell).sum())
-        refuse_together(noise="innovation", integrators=count)
     found = [model.predictor() for model in given]
     driven = [[with_past_outputs(r) for r in as_records(part)] if part else [] for part in records]
     return (found[0] if isinstance(models, Model) else found, *driven)

@@ -16,6 +16,7 @@ from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.settings import check_settings, documented, setting
 from lfrtorch.engine.cell import check_dtype
+from lfrtorch.engine.held import IN_SERIES
 from lfrtorch.fitting.exclusions import USUAL, refuse_together
 from lfrtorch.fitting.plain_settings import PlainSettings, Size
 from lfrtorch.fitting.trainer import Trainer
@@ -119,17 +120,6 @@ class Settings(PlainSettings):
             for name, size in self.init_from.sizes.items():
                 object.__setattr__(self, name, size)
         refuse_together(**self._that_exclude())
-        if self.fixed and (self.searched or self.nx == "auto"):
-            raise InputError(
-                "fixed gives entries of matrices whose sizes or ridge are auto; give the numbers "
-                "that a search without it has chosen."
-            )
-        guarantee = getattr(self.trainer, "guarantee", None)
-        if self.searched and guarantee not in (None, "stable"):
-            raise InputError(
-                f"guarantee is {guarantee}, and {', '.join(self.searched)}: auto. Every step of "
-                "the choice would be proven, for hours; give what a fit without it has chosen."
-            )
         if self.noise != "output":
             refine = self.linear.get("refine") or "prediction"
             object.__setattr__(self, "linear", {**self.linear, "refine": refine})
@@ -165,11 +155,6 @@ class Settings(PlainSettings):
                 raise InputError(f"{name} is auto, and beside a known model none is searched.")
         integer("nx", self.nx, 0)
         integer("nn", self.nn, 0)
-        if callable(self.static):
-            raise InputError(
-                "static is a module of your own; what is learned beside a known model is a "
-                "'network' or a 'polynomial'."
-            )
 
     def _check_sizes(self) -> None:
         known = isinstance(self.static, str) and self.static in LAST_SIZE
@@ -183,10 +168,6 @@ class Settings(PlainSettings):
                 raise InputError(
                     f"{name} is auto, and this static map has none; give {used}='auto'."
                 )
-        if callable(self.static) and "auto" in (self.nz, self.nw):
-            raise InputError(
-                "nz or nw is auto, and a map of one's own is not searched; give numbers."
-            )
 
     def _that_exclude(self) -> dict[str, Any]:
         """Return the settings that may exclude each other, those of parts by their own names.
@@ -208,6 +189,13 @@ class Settings(PlainSettings):
         if self.init_from is not None:
             return self.init_from.known_states
         return 0 if self.known is None else len(self.known.states)
+
+    @property
+    def states(self) -> Size | None:
+        """Number of states of a start from a linear model."""
+        if not isinstance(self.nx, int):
+            return self.nx
+        return self.nx * (1 + (self.structure in IN_SERIES)) + self.relaxations + 2 * self.modes
 
     @property
     def size_names(self) -> tuple[str, ...]:

@@ -14,17 +14,12 @@ from torch.nn import Module
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
-from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
+from lfrtorch.engine import held
 from lfrtorch.engine.cell import LFRCell, check_dtype
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.fitting.driven_states import (
-    distortion_frequencies,
-    relaxation_frequencies,
-    with_driven_states,
-)
+from lfrtorch.fitting.driven_states import with_driven_states
 from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.nonlinear_end import nonlinear_end
-from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.modes import without_slow_minor_modes
@@ -204,7 +199,7 @@ def initialise(
         K = None
         if bla.K is not None:
             K = torch.as_tensor(bla.K * scaler.y_scale).to(std) / std[:, None]
-        integrating = integrating_states(cell)
+        integrating = held.integrating_states(cell)
         uniform(cell.Cz)
         uniform(cell.Dzu)
         known = method == "zero_output" and z_feedthrough
@@ -231,52 +226,42 @@ def initialise(
             to_output = feedthrough or not z_feedthrough
             uniform(cell.Bw, 0.0 if end == "output" and to_output else _OUTPUT_RANGE)
             uniform(cell.Dyw, _OUTPUT_RANGE if to_output else 0.0)
-    if relaxations or modes:
-        inputs = [record.u for record in data]
-        corners = relaxation_frequencies(inputs, relaxations)
-        natural = corners[:0]
-        if modes:
-            pairs = zip(data, found, strict=True)
-            errors = [
-                r.errors(scaler.restore_y(t.y[0].double().numpy())) / scaler.y_scale
-                for r, t in pairs
-            ]
-            natural = distortion_frequencies(inputs, errors, modes)
-        cell = with_driven_states(cell, corners, natural, generator)
-        model = replace(model, lfr=LFR(cell))
-        if K is not None:
-            K = torch.cat([K, K.new_zeros(cell.nx - len(K), cell.ny)])
     model = replace(model, K=K)
-    if structure != "free":
-        model = replace(model, lfr=LFR(_in_blocks(cell, structure)), K=None)
-    model.lfr.cell.free_feedthrough(z=z_feedthrough, y=feedthrough)
+    if structure in held.IN_SERIES:
+        model = _in_series(model)
+    model = with_driven_states(model, data, relaxations, modes, generator)
+    cell = model.lfr.cell
+    for given in (
+        held.structure(cell, structure, before=len(bla.A)),
+        held.integrators(cell),
+        held.no_feedthrough(cell, z=z_feedthrough, y=feedthrough),
+    ):
+        cell.hold(given)
     return model
 
 
 @torch.no_grad()
-def _in_blocks(cell: LFRCell, structure: str) -> LFRCell:
-    """The cell in a structure: with the same linear model, and as long as w = 0 the same output."""
-    if structure in IN_SERIES:
-        both, before, none = torch.block_diag(cell.A, cell.A), cell, torch.zeros_like
-        sizes = cell.nu, cell.ny, 2 * cell.nx, cell.nz, cell.nw
-        cell = LFRCell(*sizes, before.static, device=both.device, dtype=both.dtype, random=False)
-        cell.A.copy_(both)
-        cell.Bu.copy_(torch.cat([before.Bu, none(before.Bu)]))
-        cell.Bw.copy_(torch.cat([none(before.Bw), before.Bw]))
-        cell.Cz.copy_(torch.cat([before.Cz, none(before.Cz)], dim=1))
-        cell.Cy.copy_(torch.cat([before.Cy, before.Cy], dim=1))
-        for name in ("Dzu", "Dyu", "Dyw"):
-            cell.get_parameter(name).copy_(before.get_parameter(name))
-    cell.structure = structure
-    for name, zeros in zeros_of(cell).items():
-        cell.get_parameter(name).masked_fill_(zeros, 0.0)
-    return cell
+def _in_series(model: Model) -> Model:
+    """The model with a second set of its states behind the static map; w alone drives those."""
+    before, none, K = model.lfr.cell, torch.zeros_like, model.K
+    sizes = before.nu, before.ny, 2 * before.nx, before.nz, before.nw
+    like = {"device": before.A.device, "dtype": before.A.dtype}
+    cell = LFRCell(*sizes, before.static, **like, random=False)
+    cell.A.copy_(torch.block_diag(before.A, before.A))
+    cell.Bu.copy_(torch.cat([before.Bu, none(before.Bu)]))
+    cell.Bw.copy_(torch.cat([none(before.Bw), before.Bw]))
+    cell.Cz.copy_(torch.cat([before.Cz, none(before.Cz)], dim=1))
+    cell.Cy.copy_(torch.cat([before.Cy, before.Cy], dim=1))
+    for name in ("Dzu", "Dyu", "Dyw"):
+        cell.get_parameter(name).copy_(before.get_parameter(name))
+    K = None if K is None else torch.cat([K, none(K)])
+    return replace(model, lfr=LFR(cell), K=K)
 
 
 def _check_structure(structure: str, nz: int, nw: int, nn: int | None) -> None:
     """Refuse what a structure has no place for with a ValueError."""
-    if structure not in STRUCTURES:
-        raise InputError(f"structure is {structure!r}; use one of {', '.join(STRUCTURES)}.")
+    if structure not in held.STRUCTURES:
+        raise InputError(f"structure is {structure!r}; use one of {', '.join(held.STRUCTURES)}.")
     if structure == "parallel":
         if nz != nw:
             raise InputError(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
+from lfrtorch.engine.cell import LFRCell
 from lfrtorch.model import Model, state_moment
 from lfrtorch.records import Record
 
@@ -19,14 +20,14 @@ def scale_states(
     # data is wrong by so much. The coordinates change by a diagonal matrix. So zeros of A stay
     # zeros, and its diagonal keeps its bits: an exact integrator stays one, and P of a proof that
     # the model contracts becomes another P. All states stay if one of their matrices is frozen or
-    # has entries that are given, or if start states are (``keep_coordinates``); of a model that
-    # diverges, too, and the covariance is 1.
+    # has another entry that a fit holds, or if start states are given (``keep_coordinates``); of a
+    # model that diverges, too, and the covariance is 1.
     cell, moment = model.lfr.cell, state_moment(model, records)
     if not torch.isfinite(moment).all():
         moment = torch.eye(cell.nx, dtype=torch.float64)
     rms = moment.diagonal().sqrt()
     into, of = (cell.Bu, cell.Bw), (cell.Cz, cell.Cy)
-    free = all(weight.requires_grad for weight in (cell.A, *into, *of)) and not cell.fixed
+    free = all(weight.requires_grad for weight in (cell.A, *into, *of)) and _scalable(cell)
     if keep_coordinates or not free:
         rms = torch.ones_like(rms)
     rms = torch.where((rms == 0) | ((rms - 1.0).abs() < 1e-9), 1.0, rms)  # what may be rounding
@@ -36,3 +37,22 @@ def scale_states(
         weight.div_(rms[:, None].to(weight))
     for weight in of:
         weight.mul_(rms.to(weight))
+    if cell.of_system and "A" in cell.of_system:
+        mask, A = cell.of_system["A"]
+        cell.of_system = {**cell.of_system, "A": (mask, A * (rms / rms[:, None]).to(A))}
+
+
+def _scalable(cell: LFRCell) -> bool:
+    """Whether other units of the states change no entry that a fit holds.
+
+    Zeros and the diagonal of A stay. Entries between integrators change, and these stay exact.
+    """
+    own = {name: (cell.held[name], cell.get_parameter(name).detach()) for name in cell.held}
+    for name, (mask, values) in {**own, **(cell.of_system or {})}.items():
+        moves = mask & (values != 0).cpu()
+        if name == "A":
+            chained = (values.diagonal() == 1).cpu()
+            moves &= ~(torch.eye(cell.nx, dtype=torch.bool) | chained[:, None] & chained)
+        if name in ("A", "Bu", "Bw", "Cz", "Cy") and moves.any():
+            return False
+    return True

@@ -19,7 +19,6 @@ from lfrtorch._support.reasons import Reason, told
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting import state_file
-from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.fit_state import FitState, Progress
 from lfrtorch.fitting.windows import windows
 from lfrtorch.least_squares.guarantee import Name
@@ -194,7 +193,6 @@ class Fit:
             for p in model.lfr.parameters() if ranks.world > 1 else ():
                 p.copy_(ranks.first(p.detach()))
         guarantee = self.trainer.guarantee
-        refuse_together(structure=model.lfr.cell.structure, guarantee=guarantee)
         longest = max(record.samples for record in as_records(train))
         if horizon is not None:
             nx = model.lfr.cell.nx

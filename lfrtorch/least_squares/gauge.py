@@ -1,8 +1,6 @@
-"""Gauge directions: changes of the parameters that leave the simulated output as it is.
+"""Columns of the Jacobian that gauge directions leave: the others follow from them.
 
-Many sets of matrices describe the same model. A change of coordinates x -> T x changes A, Bu, Bw,
-Cz and Cy, and no output. The same holds for z and w if the static map is a network, whose weights
-absorb the change. To first order these changes are directions G in θ with J G = 0: some columns of
+Directions G in θ that change no output (``engine.gauge_directions``) have J G = 0: some columns of
 J are combinations of others. Those columns need not be computed. With the columns ``kept``,
 J = J[:, kept] @ expand, exactly.
 
@@ -21,9 +19,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.gauge_directions import ROUNDING, gauge_directions
 from lfrtorch.engine.weights import Weights
 
 DEPENDENT = 1e-3
@@ -61,10 +59,6 @@ class Reduction(NamedTuple):
         return own if self.expand is None else self.expand.mT @ own
 
 
-ROUNDING = 1e-10
-"""A pivot below this fraction of the norm of G is a rounding error."""
-
-
 @torch.no_grad()
 def reduction(
     model: LFRCell | Weights,
@@ -80,7 +74,7 @@ def reduction(
     # still do. ``fixed`` entries of the free parameters have columns of zeros.
     W = model.weights()
     layout, states = W.layout, initial_states.numel()
-    G = _directions(W, initial_states)[:, 0 if coordinates else W.nx**2 :]
+    G = gauge_directions(W, initial_states)[:, 0 if coordinates else W.nx**2 :]
     free = np.concatenate([layout.free, len(W.flat) + np.arange(states)])
     P, like = len(free), initial_states
     places, size = np.arange(P), np.linalg.norm(G)
@@ -142,43 +136,3 @@ def _expanded(
 def everything(count: int) -> Reduction:
     """The reduction that keeps all of so many columns."""
     return Reduction(torch.arange(count), None)
-
-
-def _directions(
-    W: Weights, initial_states: Float[Tensor, "S nx"]
-) -> Float[Array, "numbers directions"]:
-    """Gauge directions G: of all numbers, then the initial states."""
-    # T is every matrix with one entry 1, stacked: a direction for each. x -> (I + εT) x changes
-    # A to A + ε (TA - AT), and so on; z -> (I + εT) z and w -> (I + εT)⁻¹ w likewise.
-    T = _units(W.nx, W.flat)
-    of_x = {"A": T @ W.A - W.A @ T, "Bu": T @ W.Bu, "Bw": T @ W.Bw, "Cz": -W.Cz @ T}
-    groups = [_flat(W, of_x | {"Cy": -W.Cy @ T, "x0": initial_states @ T.mT}, initial_states)]
-    weights = W.map.named_weights(W.phi)
-    for symmetry in W.map.symmetries:
-        own = symmetry.place
-        T = _units(own.stop - own.start, W.flat)
-        changes: dict[str, Tensor] = dict(symmetry.changes(T, weights))
-        for name in ("Cz", "Dzu") if symmetry.signal == "z" else ("Bw", "Dyw"):
-            matrix = getattr(W, name)
-            change = changes[name] = matrix.new_zeros(len(T), *matrix.shape)
-            if symmetry.signal == "z":
-                change[:, own] = T @ matrix[own]
-            else:
-                change[:, :, own] = -matrix[:, own] @ T
-        groups.append(_flat(W, changes, initial_states))
-    return to_float64(torch.cat(groups).mT)
-
-
-def _flat(W: Weights, changes: dict[str, Tensor], initial_states: Tensor) -> Tensor:
-    """Changes by name as rows of all numbers, then the initial states."""
-    rows = len(next(iter(changes.values())))
-    found = W.flat.new_zeros(rows, len(W.flat) + initial_states.numel())
-    for name, change in changes.items():
-        place = slice(len(W.flat), None) if name == "x0" else W.layout.place(name)
-        found[:, place] = change.flatten(1)
-    return found
-
-
-def _units(n: int, like: Tensor) -> Float[Tensor, "{n}*{n} {n} {n}"]:
-    """The n² matrices with one entry 1."""
-    return torch.eye(n * n, dtype=like.dtype, device=like.device).reshape(n * n, n, n)

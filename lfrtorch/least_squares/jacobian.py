@@ -13,11 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch.distributed import Ranks
 from lfrtorch.least_squares.gauge import Reduction
+from lfrtorch.least_squares.held_steps import ProjectedSystem, Projection
 from lfrtorch.least_squares.linear_systems import (
     BroadcastSystem,
     CholeskySystem,
@@ -42,22 +43,21 @@ CACHED_BYTES = 1 << 27
 class Jacobian:
     """J (M, P) of a residual at one θ."""
 
-    # ``fixed`` columns are zeros. The first ``shared`` columns are those of parameters that all
-    # records have; the others are of start states that the parts eliminate.
+    # ``project`` leaves what is held, columns of zeros. The first ``shared`` columns are those of
+    # parameters that all records have; the others are of start states that the parts eliminate.
 
     def __init__(
         self,
         parts: Sequence[TermRows | PenaltyRows],
         reduced: Reduction,
-        fixed: Bool[Tensor, " P"],
+        project: Projection,
         ranks: Ranks,
         shared: int,
         rank: int,
         bounded: Callable[[System], System] | None = None,
     ) -> None:
-        self.parts, self._reduced, self._fixed, self.ranks = parts, reduced, fixed, ranks
+        self.parts, self._reduced, self._project, self.ranks = parts, reduced, project, ranks
         self._shared, self._rank, self._bounded = shared, rank, bounded
-        self._any_fixed = bool(fixed.any())
 
     def system(self, damping: float, truncation: float) -> tuple[System, Float[Tensor, " P"]]:
         """The least-squares system of J and its gradient Jᵀr; see the search's ``Jacobian``."""
@@ -75,7 +75,7 @@ class Jacobian:
         penalty = None
         if penalties:
             squares = torch.stack([part.diagonal.square() for part in penalties])
-            penalty = self._free(squares.sum(0))
+            penalty = squares.sum(0).masked_fill(self._project.entries, 0.0)
         if states:
             system, gradient = self._eliminated(total, states, penalty, truncation)
         elif isinstance(total, GramAccumulator):
@@ -84,17 +84,13 @@ class Jacobian:
             system, gradient = self._orthogonal(total.R, penalty, truncation)
         for part in penalties:
             gradient = gradient + part.diagonal * part.residual
-        gradient = self._free(gradient)
-        system = system if self._bounded is None else self._bounded(system)
+        gradient = self._project(gradient)
+        if self._bounded is not None:
+            held = ProjectedSystem(system, self._project) if self._project.held else system
+            system = self._bounded(held)
         if self.ranks.world == 1:
             return system, gradient
         return BroadcastSystem(system, self.ranks), self.ranks.first(gradient)
-
-    def _free(self, columns: Float[Tensor, "*rows P"]) -> Float[Tensor, "*rows P"]:
-        """Columns with zeros for those that are fixed."""
-        if not self._any_fixed:
-            return columns
-        return columns.masked_fill(self._fixed[: columns.shape[-1]], 0.0)
 
     def _normal(
         self, G: Float[Tensor, "columns columns"], penalty: Float[Tensor, " P"] | None
@@ -102,14 +98,14 @@ class Jacobian:
         """The system and the gradient, by the normal equations."""
         expand = self._reduced.expand
         G, gradient = G[:-1, :-1], self._reduced.gradient(G[:-1, -1])
-        if expand is not None and not self._any_fixed:
+        if expand is not None and not self._project.held:
             ridge = 0.0 if penalty is None else float(penalty[0])
             if penalty is None or bool((penalty == ridge).all()):
                 return ReducedSystem(G, expand, ridge), gradient
         # JᵀJ = expandᵀ G expand: the columns first, then the rows of a symmetric matrix.
         if expand is not None:
             G = self._reduced.columns(self._reduced.columns(G).mT)
-        G = self._free(self._free(G).mT)
+        G = self._project(self._project(G).mT)
         return CholeskySystem(
             G if penalty is None else G + torch.diag(penalty), self._rank
         ), gradient
@@ -118,7 +114,7 @@ class Jacobian:
         self, R: Float[Tensor, "k columns"], penalty: Float[Tensor, " P"] | None, truncation: float
     ) -> tuple[System, Float[Tensor, " P"]]:
         """The system and the gradient, by singular values."""
-        R, r = self._free(self._reduced.columns(R[:, :-1])), R[:, -1]
+        R, r = self._project(self._reduced.columns(R[:, :-1])), R[:, -1]
         rows = R if penalty is None else torch.cat([R, penalty.sqrt().diag()])
         return SVDSystem(rows, truncation), R.mT @ r
 
@@ -131,14 +127,15 @@ class Jacobian:
     ) -> tuple[System, Float[Tensor, " P"]]:
         """The system and the gradient, the start states eliminated."""
         states = StartStates(*map(torch.cat, zip(*found, strict=True)))
-        states = states._replace(A=self._free(states.A))
+        states = states._replace(A=self._project(states.A))
         gram = isinstance(total, GramAccumulator)
         if gram:
-            left, gradient = self._free(self._free(total.G[:-1, :-1]).mT), total.G[:-1, -1]
+            left = self._project(self._project(total.G[:-1, :-1]).mT)
+            gradient = total.G[:-1, -1]
         else:
-            left = self._free(total.R[:, :-1])
+            left = self._project(total.R[:, :-1])
             gradient = left.mT @ total.R[:, -1]
-        whole = gradient.new_zeros(len(self._fixed))
+        whole = gradient.new_zeros(len(self._project.entries))
         penalty = whole if penalty is None else penalty
         system = EliminatedSystem(left, states, penalty, gram=gram, truncation=truncation)
         whole = whole.clone()
@@ -148,22 +145,24 @@ class Jacobian:
 
     def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """J dθ."""
-        d_theta = self._free(d_theta)
+        d_theta = self._project(d_theta)
         reduced = self._reduced.reduced(d_theta[: self._shared])
         found = [part.tangent(d_theta, reduced) for part in self.parts]
         return found[0] if len(found) == 1 else torch.cat(found)
 
     def adjoint(self, residual: Float[Tensor, " M"]) -> Float[Tensor, " P"]:
         """Jᵀ residual."""
-        gradient = residual.new_zeros(len(self._fixed))
+        gradient = residual.new_zeros(len(self._project.entries))
         reduced = residual.new_zeros(len(self._reduced.kept))
         several = len(self.parts) > 1
         each = residual.split([part.count for part in self.parts]) if several else [residual]
         for part, own in zip(self.parts, each, strict=True):
             part.adjoint(own, gradient, reduced)
         gradient[: self._shared] += self._reduced.gradient(reduced)
-        return self.ranks.sum(self._free(gradient))
+        return self.ranks.sum(self._project(gradient))
 
     def whole(self) -> Float[Tensor, "M P"]:
         """J as one matrix, for small problems."""
-        return self._free(torch.cat([part.whole(len(self._fixed)) for part in self.parts]))
+        return self._project(
+            torch.cat([part.whole(len(self._project.entries)) for part in self.parts])
+        )

@@ -10,16 +10,16 @@ from functools import cached_property, partial
 from typing import Self
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.least_squares.exact_integrators import fixed_parameters
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
 from lfrtorch.least_squares.guarantee import Guarantee, Name, guarantee_of
+from lfrtorch.least_squares.held_steps import HeldSteps
 from lfrtorch.least_squares.jacobian import Jacobian
 from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, Point
 from lfrtorch.least_squares.ridge import Ridge, RidgePenalty, ridge_by_entry
@@ -49,7 +49,6 @@ class Problem(LeastSquares):
         *,
         ridge: Ridge = 0.0,
         guarantee: Guarantee | None = None,
-        fixed: Bool[Tensor, " free"] | None = None,
     ) -> None:
         self.lfr, self.errors, self.ranks = lfr, errors, errors.ranks
         self._terms: list[Term] = [errors, *others]
@@ -57,9 +56,7 @@ class Problem(LeastSquares):
         """θ_0."""
         self.weigh(ridge)
         self._guarantee = guarantee
-        self.fixed = torch.zeros_like(self.theta, dtype=torch.bool)
-        """Which entries of θ are constants: columns of zeros in J."""
-        self.fixed[: errors.parameters.own] = fixed_parameters(lfr.cell) if fixed is None else fixed
+        self._held = HeldSteps(lfr.cell, errors.parameters, len(self.theta))
         self._reduced: Reduction | None = None
         self._checked: set[bool] = set()  # whether the memory of these systems was checked
 
@@ -141,10 +138,11 @@ class Problem(LeastSquares):
         return self.evaluate(theta).residual
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
-        """θ, or one near it that keeps the guarantee."""
+        """θ, or one near it that keeps what is held and the guarantee."""
+        found = self._held.admissible(theta)
         if self._guarantee is None:
-            return theta
-        return self.ranks.first(self._guarantee.admissible(theta))
+            return found
+        return self.ranks.first(self._guarantee.admissible(found))
 
     def linearise(self, theta: Float[Tensor, " P"], *, eliminate: bool = True) -> Jacobian:
         """dr/dθ at θ."""
@@ -174,7 +172,8 @@ class Problem(LeastSquares):
             reduced = self._reduction(theta)
         bounded = None if self._guarantee is None else partial(self._guarantee.bounded, theta)
         rank = len(reduced.kept) if reduced.expand is not None else self.rank
-        return Jacobian(rows, reduced, self.fixed, self.ranks, shared, rank, bounded)
+        project = self._held.projection(theta)
+        return Jacobian(rows, reduced, project, self.ranks, shared, rank, bounded)
 
     @cached_property
     def _worth_reducing(self) -> bool:
@@ -199,7 +198,7 @@ class Problem(LeastSquares):
             self.errors.parameters.initial_states(theta),
             coordinates=not held,
             before=self._reduced,
-            fixed=self.fixed,
+            fixed=self._held.entries,
         )
         # Rounding errors decide between columns that are as good; processes must agree.
         kept, expand = found
@@ -309,7 +308,7 @@ def _check_measured(model: Model) -> None:
         name
         for name in ("Cy", "Dyu", "Dyw")
         if cell.get_parameter(name).numel()
-        and not (name in cell.fixed and bool(cell.fixed[name].all()))
+        and not (name in cell.held and bool(cell.held[name].all()))
     ]
     if free or cell.map.outputs_have_parameters:
         raise InputError(

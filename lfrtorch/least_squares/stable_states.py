@@ -17,9 +17,9 @@ from torch import Tensor
 from lfrtorch._support.threads import to_float64
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.held import integrating_states
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.least_squares.bounded_system import ROUNDING, BoundedSystem
-from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.least_squares.linear_systems import System
 
 
@@ -31,6 +31,10 @@ def largest_modulus(samples: int) -> float:
 NEAR = 0.9
 """Moduli below this part of the limit are left out of a step's bounds: no step goes so far, and
 eigenvalues at 0, those of delays, have no derivative."""
+
+
+_NEWTON = 10
+"""Steps of Newton's method for the least change; three are enough after a step of a search."""
 
 
 def fading(A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"]) -> Float[Tensor, "n n"]:
@@ -60,6 +64,24 @@ def stabilised(
     return found
 
 
+def within(
+    A: Float[Tensor, "nx nx"],
+    integrating: Bool[Tensor, " nx"],
+    held: Bool[Tensor, "nx nx"],
+    limit: float,
+) -> Float[Tensor, "nx nx"]:
+    """A with the least change of entries that are not held that brings its eigenvalues within."""
+    for _ in range(_NEWTON):
+        bounds = PoleBounds(A, integrating, limit)
+        beyond = bounds.room < 0
+        if not beyond.any():
+            break
+        slopes = bounds.slopes[beyond].masked_fill(held.flatten(), 0.0)
+        change = torch.linalg.pinv(slopes) @ bounds.room[beyond].to(slopes)
+        A = A + change.view_as(A)
+    return A
+
+
 class Stable:
     """A's eigenvalues on the way of a search, which fade within a record."""
 
@@ -68,6 +90,8 @@ class Stable:
 
     def __init__(self, cell: LFRCell, samples: int, ranks: Ranks) -> None:
         self._nx, self._integrating = cell.nx, integrating_states(cell)
+        held = cell.held.get("A", torch.zeros(cell.A.shape, dtype=torch.bool)).to(cell.A.device)
+        self._held = held & ~self._integrating
         radius = spectral_radius(fading(cell.A, self._integrating)).double()
         self._limit = max(largest_modulus(samples), float(ranks.first(radius)))
 
@@ -76,7 +100,10 @@ class Stable:
         if not torch.isfinite(theta).all():
             return theta
         A = self._matrix(theta)
-        found = stabilised(A, self._integrating, self._limit)
+        if self._held.any():
+            found = within(A, self._integrating, self._held, self._limit)
+        else:
+            found = stabilised(A, self._integrating, self._limit)
         return theta if found is A else torch.cat([found.flatten(), theta[self._nx**2 :]])
 
     def bounded(self, theta: Float[Tensor, " P"], system: System) -> System:

@@ -242,18 +242,12 @@ class SignalFit:
         cell = linear_cell(A - K @ C, Bu, C, Dyu)
         for parameter in (cell.A, cell.Cy):
             parameter.requires_grad_(observed)
-        free = {"Bu": free_B, "Dyu": free_D}
-        fixed = [
-            torch.as_tensor(~free[name].ravel())
-            if name in free
-            else torch.zeros(p.numel(), dtype=torch.bool)
-            for name, p in cell.named_parameters()
-            if p.requires_grad
-        ]
+        for name, free in (("Bu", free_B), ("Dyu", free_D)):
+            cell.hold({name: (torch.as_tensor(~free), cell.get_parameter(name).detach())})
         errors = SimulationErrors(cell, self._driven, Ranks())
         measured = slice(nu, nu + ny) if self._prediction and stable else None
         walls = [_PoleWall(errors, measured)] if observed else []
-        return Problem(LFR(cell), errors, walls, fixed=torch.cat(fixed))
+        return Problem(LFR(cell), errors, walls)
 
     def _observer(self, matrices: Matrices, variances: Array) -> Array:
         """Kalman gain (nx, ny) for state noise of these variances."""

@@ -702,7 +702,6 @@ def test_user_errors_are_one_message(
         (["degree=auto"], "degree is auto, and this static map has none; give nn='auto'"),
         (["nn=auto", "static=polynomial"], "nn is auto, and this static map has none"),
         (["init=magic"], "init is 'magic'; give 'zero_output' or 'paper'"),
-        (["static=own", "nz=auto"], "a map of one's own is not searched; give numbers"),
         (["activation=softsign"], "activation is 'softsign'"),
         (["trainer.damping=-1"], "damping is -1"),
         (["bla.refine=output"], "refine is 'output'"),

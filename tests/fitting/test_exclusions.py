@@ -46,7 +46,7 @@ PAIRS = [
 """Every row with every pair of values that it excludes."""
 
 STARTING = {"structure", "relaxations", "modes", "z_feedthrough", "static"}
-FITTING = {"structure", "noise", "horizon", "average", "guarantee"}
+FITTING = {"noise", "horizon", "average", "guarantee"}
 
 
 def settings(given: dict[str, Any]) -> Settings:
@@ -96,33 +96,15 @@ def test_a_start_cannot_have_both(row: Exclusion, given: dict, record: Record, l
 
 @pytest.mark.parametrize(
     ("row", "given"),
-    # The predictor of a model with a structure is an ordinary model.
-    [(row, given) for row, given in PAIRS if {"structure", "noise"} != {*given} <= FITTING],
+    [(row, given) for row, given in PAIRS if {*given} <= FITTING],
     ids=str,
 )
 def test_a_fit_cannot_have_both(row: Exclusion, given: dict, record: Record, linear: LinearModel):
-    options = {
-        name: value for name, value in given.items() if name not in ("structure", "guarantee")
-    }
-    structure = given.get("structure", "free")
-    models = [
-        initialise(linear, record, nz=1, nw=1, nn=2, structure=structure, seed=seed)
-        for seed in range(2)
-    ]
+    options = {name: value for name, value in given.items() if name != "guarantee"}
+    models = [initialise(linear, record, nz=1, nw=1, nn=2, seed=seed) for seed in range(2)]
     trainer = lfrtorch.Adam(1, 1e-2, given.get("guarantee"))
     with pytest.raises(InputError, match=message(row)):
         lfrtorch.fit(models, record, trainer=trainer, **options)
-
-
-@pytest.mark.parametrize("guarantee", ["contracting", 0.9])
-def test_sizes_are_not_chosen_with_a_proof_of_every_step(guarantee: Any):
-    trainer = lfrtorch.LevenbergMarquardt(guarantee=guarantee)
-    with pytest.raises(
-        InputError, match=r"nn, ridge: auto\. Every step .* give what a fit without"
-    ):
-        Settings(nx=2, nn="auto", ridge="auto", trainer=trainer)
-    stable = lfrtorch.LevenbergMarquardt(guarantee="stable")
-    assert Settings(nx=2, nn="auto", trainer=stable).searched == ("nn",)
 
 
 def test_what_is_usual_is_the_default():

@@ -177,7 +177,7 @@ def test_parts_of_a_file_begin_at_their_own_outputs(tmp_path) -> None:
     ("settings", "message"),
     [
         ({"nx": 3, "nn": 2}, "the 2 outputs are the states; give nx=2"),
-        ({"nx": 2, "nn": 2, "nz": 1, "structure": "wiener"}, "which no structure has"),
+        ({"nx": 2, "nn": 2, "nz": 1, "structure": "parallel"}, "4 states for 2 outputs"),
         ({"nx": 2, "nn": 2, "relaxations": 1}, "3 states for 2 outputs; give nx=2"),
         ({"nx": 2, "nn": "auto"}, "nn: auto, and sizes are not searched"),
     ],

@@ -57,7 +57,7 @@ def test_the_same_model_is_put_into_coordinates_that_have_the_entries(names: tup
     difference = found.simulate(u) - model.simulate(u)
     assert np.abs(difference).max() < 1e-5 * np.abs(model.simulate(u)).max()
     assert found.lfr.cell.Cy.tolist() == [[pytest.approx(1.0 / scale), 0.0]]
-    assert {*found.lfr.cell.fixed} == {*names}
+    assert {*found.lfr.cell.held} == {*names}
 
 
 def test_a_fit_keeps_what_is_given_and_is_as_good(tmp_path: Path):
@@ -76,7 +76,7 @@ def test_a_fit_keeps_what_is_given_and_is_as_good(tmp_path: Path):
     assert cell.A[1].tolist()[1] == pytest.approx(1 - 0.08, abs=0.05)  # the damping
     run.model.save(tmp_path / "model")
     again = lfrtorch.load(tmp_path / "model")
-    assert {*again.lfr.cell.fixed} == {*PHYSICAL}
+    assert {*again.lfr.cell.held} == {*PHYSICAL}
 
 
 def test_it_is_fitted_again_and_in_windows():
@@ -108,8 +108,8 @@ def test_what_is_no_matrix_is_refused(given: dict[str, Any], message: str):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"nx": "auto", "fixed": {"Cy": [[1.0, 0.0]]}}, "whose sizes or ridge are auto"),
-        ({"ridge": "auto", "fixed": {"Cy": [[1.0, 0.0]]}}, "whose sizes or ridge are auto"),
+        ({"nx": "auto", "fixed": {"Cy": [[1.0, 0.0]]}}, "give a number for what is auto"),
+        ({"nw": "auto", "fixed": {"Bw": [[1.0], [0.0]]}}, "give a number for what is auto"),
         ({"fixed": {"Cy": [[1.0, 0.0, 0.0]]}}, r"the model's has \(1, 2\)"),
     ],
 )

@@ -70,7 +70,7 @@ def away(p: Weights, fixed: tuple[str, ...] = ()) -> Model:
             step = 0.0 if name in fixed else 0.1
             weight.copy_(torch.from_numpy(p[name] + step * rng.normal(size=weight.shape)))
             if name in fixed:
-                cell.fix(name, torch.ones_like(weight, dtype=torch.bool))
+                cell.hold({name: (torch.tensor(True), weight.detach())})
     scaler = Scaler(np.zeros(nu), np.ones(nu), np.zeros(ny), np.ones(ny))
     inputs, outputs = ([Channel(f"{s}{i}") for i in range(n)] for s, n in (("u", nu), ("y", ny)))
     return Model(LFR(cell), scaler, 1.0, tuple(inputs), tuple(outputs))

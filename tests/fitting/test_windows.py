@@ -108,7 +108,6 @@ def test_windows_that_cannot_be_say_so(horizon, options, message):
     [
         ({"horizon": 1}, "horizon is 1; give a whole number of at least 2."),
         ({"horizon": "all"}, "horizon is 'all'"),
-        ({"horizon": 50, "noise": "innovation"}, "predictions one sample"),
     ],
 )
 def test_horizons_that_cannot_be_say_so(given, message):

@@ -1,5 +1,6 @@
 """The one residual over records of different lengths, starts and windows."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -449,9 +450,15 @@ def test_a_jacobian_asks_for_room_once(model: Model, monkeypatch):
 RIDGE_AND_ROOM = pytest.mark.parametrize(("ridge", "kept"), [(0.0, True), (0.5, False)])
 
 
-def some_fixed(model: Model) -> torch.Tensor:
-    """Every third free parameter of the module, the first one too."""
-    return torch.arange(model.parameter_count) % 3 == 0
+def holding_some(model: Model) -> tuple[Model, torch.Tensor]:
+    """The model with every third of its entries held, the first one too, and their mask."""
+    found = deepcopy(model)
+    held = torch.arange(model.parameter_count) % 3 == 0
+    named = list(found.lfr.cell.named_parameters())
+    masks = held.split([p.numel() for _, p in named])
+    for (name, p), mask in zip(named, masks, strict=True):
+        found.lfr.cell.hold({name: (mask.view_as(p), p.detach())})
+    return found, held
 
 
 @pytest.mark.parametrize(
@@ -466,10 +473,9 @@ def test_fixed_entries_have_columns_of_zeros(
     records = all_kinds(model, given=False)
     theta = Problem.of(model, records).theta + 0.1
     plain = Problem.of(model, records, ridge=ridge).jacobian(theta)
-    problem = Problem.of(model, records, ridge=ridge)
-    # Start states follow.
-    held = torch.cat([some_fixed(model), torch.zeros(4 * 2, dtype=torch.bool)])
-    problem.fixed = held
+    holding, own = holding_some(model)
+    problem = Problem.of(holding, records, ridge=ridge)
+    held = torch.cat([own, torch.zeros(4 * 2, dtype=torch.bool)])  # start states follow
     r, J = problem.residual(theta), problem.jacobian(theta)
     assert torch.equal(J[:, held], torch.zeros_like(J[:, held]))
     # The same recurrence from a periodic start known to 1e-10.
@@ -503,15 +509,15 @@ def test_search_leaves_fixed_entries_and_brings_the_rest_home(
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
     records = [measure(model, 60, seed=i) for i in range(2)]
     theta = Problem.of(model, records).theta
-    problem = Problem.of(model, records, ridge=1e-8 * ridge)
-    problem.fixed = some_fixed(model)
+    holding, held = holding_some(model)
+    problem = Problem.of(holding, records, ridge=1e-8 * ridge)
     away = 0.02 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
-    away[problem.fixed] = 0.0
+    away[held] = 0.0
     optimiser = LevenbergMarquardt(max_iter=100)
     state = optimiser.init(problem, theta + away)
     while not state.reason:
         state = optimiser.step(problem, state)
-    assert torch.equal(state.theta[problem.fixed], theta[problem.fixed])
+    assert torch.equal(state.theta[held], theta[held])
     # Noise-free, and θ_start of the ridge is the planted θ: the search ends at rounding.
     assert problem.rmse(state.theta) < 1e-8
 

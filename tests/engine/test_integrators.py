@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.held import held_parameters, integrating_states, integrators
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.least_squares.adam import Adam
-from lfrtorch.least_squares.exact_integrators import fixed_parameters, integrating_states
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.maps.network import Network
@@ -95,19 +95,21 @@ def test_a_mean_has_those_of_all():
     assert integrating_states(mean.lfr.cell).tolist() == 3 * [False, True]
 
 
-def test_what_is_seen_is_free():
+def test_a_state_that_is_seen_integrates_no_more():
     cell = LFRCell(1, 1, 3, 1, 1, Network(1, 1, 2), dtype=torch.float64, random=False)
-    assert not fixed_parameters(cell).any()
+    cell.hold(integrators(cell))
+    assert not held_parameters(cell).any()
     with torch.no_grad():
         cell.A.copy_(torch.tensor([[0.9, 0, 0], [1, 1, 0], [2, 3, 1]]))
     assert integrating_states(cell).tolist() == [False, True, True]
     with torch.no_grad():
         cell.Cz[0, 1] = 1e-9
     assert integrating_states(cell).tolist() == [False, False, True]
+    cell.hold(integrators(cell))
     cell.A.requires_grad_(False)
-    mask = fixed_parameters(cell)
+    mask = held_parameters(cell)
     assert len(mask) == sum(p.numel() for p in cell.parameters() if p.requires_grad)
     assert mask.sum() == 1  # of Cz
     with torch.no_grad():
         cell.A[0, 2] = 1e-9
-    assert not fixed_parameters(cell).any()
+    assert not integrating_states(cell).any()

@@ -11,7 +11,7 @@ import torch
 from reference import measure, random_cell, random_model
 
 import lfrtorch
-from lfrtorch.engine.block_form import IN_SERIES, zeros_of
+from lfrtorch.engine.held import IN_SERIES, structure
 from lfrtorch.maps.network import Network
 from lfrtorch.model import Model
 from lfrtorch.records import Record
@@ -33,11 +33,9 @@ def truth(kind: str) -> Model:
     branches = 2 if kind == "parallel" else 1
     nx = 2 * branches
     cell = random_cell(1, 1, nx, branches, branches, 4, radius=0.8, feedback=1.0, seed=3)
-    cell.structure = kind
+    cell.hold(structure(cell, kind))
     assert isinstance(cell.static, Network)
     with torch.no_grad():
-        for name, zeros in zeros_of(cell).items():
-            cell.get_parameter(name).masked_fill_(zeros, 0.0)
         cell.Dyw.fill_(1.0 if kind == "wiener" else 0.0)
         cell.static.Ww.mul_(2.0)
         cell.static.Wz.mul_(2.0)
@@ -60,11 +58,11 @@ def test_a_fit_and_a_file_keep_the_blocks(kind: str, record: Record, tmp_path: P
     cell = fitted.lfr.cell
     error = np.std(fitted.simulate(record) - record.y)
     assert error < 0.98 * np.std(linear.simulate(record) - record.y)
-    assert zeros_of(cell)
-    for name, zeros in zeros_of(cell).items():
+    assert cell.held.keys() == structure(cell, kind).keys()
+    for name, zeros in cell.held.items():
         assert not cell.get_parameter(name)[zeros].any(), name
     again = lfrtorch.load(fitted.save(tmp_path / "model"))
-    assert again.lfr.cell.structure == kind
+    assert all(again.lfr.cell.held[name].equal(mask) for name, mask in cell.held.items())
     assert again.parameter_count == fitted.parameter_count
     assert again.parameter_count < sum(p.numel() for p in again.lfr.parameters())
 

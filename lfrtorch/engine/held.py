@@ -1,0 +1,121 @@
+"""Entries of a model that a fit holds, as masks with values.
+
+Each function returns what it holds, by the names of the parameters. ``LFRCell.hold`` puts the
+values in and unites the masks; where two of them want other values of an entry, that is an error.
+Gauge, steps and the count of parameters read the united mask alone.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.weights import Held
+
+STRUCTURES = ("free", "wiener", "hammerstein", "wiener_hammerstein", "parallel")
+"""Blocks that a model may be made of."""
+
+IN_SERIES = ("wiener_hammerstein", "parallel")
+"""Structures with as many states before the static map as after it."""
+
+
+def structure(cell: LFRCell, kind: str, *, before: int | None = None) -> Held:
+    """Zeros of a model that is made of blocks.
+
+    - ``"free"``: none;
+    - ``"wiener"``: w acts on the output alone, Bw = 0;
+    - ``"hammerstein"``: z is of the inputs alone, Cz = 0;
+    - ``"wiener_hammerstein"``: the first states, which u drives, make z; the others, which w alone
+      drives, see nothing of them. So w never comes back to z;
+    - ``"parallel"``: the same with a network in which each neuron sees one z and acts on the w of
+      the same number: branches that share their poles at most.
+
+    Args:
+        cell: its sizes count.
+        kind: which of these.
+        before: how many states make z. Default: half of them.
+    """
+    every, zero = torch.tensor(True), torch.tensor(0.0)
+    after = torch.arange(cell.nx) >= (cell.nx // 2 if before is None else before)
+    found: dict[str, Tensor] = {}
+    if kind == "wiener":
+        found = {"Bw": every}
+    elif kind == "hammerstein":
+        found = {"Cz": every}
+    elif kind in IN_SERIES:
+        found = {"A": after[:, None] != after, "Bu": after[:, None], "Bw": ~after[:, None]}
+        found["Cz"] = after
+    if kind == "parallel":
+        assert cell.static is not None
+        neurons = len(cell.static.get_parameter("Wz"))
+        own = torch.arange(neurons) * cell.nz // neurons
+        apart = own[:, None] != torch.arange(cell.nz)
+        found |= {"static.Wz": apart, "static.Ww": apart.mT}
+    return {name: (mask, zero) for name, mask in found.items()}
+
+
+def no_feedthrough(cell: LFRCell, *, z: bool, y: bool) -> Held:
+    """Zeros of a model whose input does not act on ``z``, or on ``y``, at once.
+
+    On y it acts through w, too, so without ``y`` that path is closed: at Dzu, or else at Dyw. Known
+    equations keep what they say themselves.
+    """
+    known = cell.map.known
+    first_z, first_w = (0, 0) if known is None else (known.nz, known.nw)
+    zero, found = torch.tensor(0.0), dict[str, tuple[Tensor, Tensor]]()
+    if not z:
+        found["Dzu"] = (torch.arange(cell.nz) >= first_z)[:, None], zero
+    if not y:
+        found["Dyu"] = torch.tensor(True), zero
+    if z and not y:
+        found["Dyw"] = torch.arange(cell.nw) >= first_w, zero
+    return found
+
+
+def past_outputs(cell: LFRCell) -> Held:
+    """Zeros of a predictor, whose last inputs are the measured outputs: none acts at once."""
+    last = torch.arange(cell.nu) >= cell.nu - cell.ny
+    return {name: (last, torch.tensor(0.0)) for name in ("Dzu", "Dyu")}
+
+
+def measured_states(cell: LFRCell) -> Held:
+    """The output's equation of a model whose states are its normalised outputs."""
+    every, zero = torch.tensor(True), torch.tensor(0.0)
+    return {"Cy": (every, torch.eye(cell.nx)), "Dyu": (every, zero), "Dyw": (every, zero)}
+
+
+def integrators(cell: LFRCell) -> Held:
+    """Columns of A and Cz of the exact integrators, as they are."""
+    states = integrating_states(cell)
+    if not states.any():
+        return {}
+    return {"A": (states, cell.A.detach()), "Cz": (states, torch.tensor(0.0))}
+
+
+def integrating_states(cell: LFRCell) -> Bool[Tensor, " nx"]:
+    """States that are exact integrators.
+
+    Such a state's column of A is 0 but for a 1 on the diagonal and entries in rows of other
+    integrators, and its column of Cz is 0: nothing but integrators and the output sees it. Then
+    z = 1 is a pole of the model whatever its other parameters are, and a shift of that state shifts
+    the output for good. Two in a row are a double pole.
+    """
+    A = cell.A.detach()
+    acts = A - torch.diag(A.diagonal()) != 0
+    candidates = (A.diagonal() == 1) & ~cell.Cz.detach().any(dim=0)
+    found = torch.zeros_like(candidates)
+    for _ in range(cell.nx):  # the last of a chain comes first
+        found = candidates & ~acts[~found].any(dim=0)
+    return found
+
+
+def held_parameters(cell: LFRCell) -> Bool[Tensor, " free"]:
+    """Entries of the free parameters, one after another, that a fit holds."""
+    masks = [
+        cell.held.get(name, torch.zeros(p.shape, dtype=torch.bool)).flatten()
+        for name, p in cell.named_parameters()
+        if p.requires_grad
+    ]
+    return torch.cat([torch.zeros(0, dtype=torch.bool), *masks]).to(cell.A.device)

@@ -1,0 +1,216 @@
+"""Settings that hold entries go together: a fit keeps what each of them holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import lfrtorch
+from lfrtorch import InputError, LevenbergMarquardt, Record, Settings, identify
+from lfrtorch.engine.held import integrating_states
+from lfrtorch.model import Model
+
+pytestmark = pytest.mark.numeric
+
+FREE = float("nan")
+SEARCH = LevenbergMarquardt(max_iter=6)
+
+
+def saturating(integrates: bool = False) -> Record:
+    """A first-order lag with a saturated input, noise on its state and, if asked, an integrator."""
+    random = np.random.default_rng(0)
+    u, noise = random.standard_normal((2, 400))
+    x, s, y = np.zeros(2), 0.0, np.zeros(400)
+    for k in range(400):
+        y[k] = s if integrates else x[0] + 0.5 * x[1]
+        w = np.tanh(1.5 * u[k])
+        s += x[0]
+        x = np.array([0.8 * x[0] + 0.3 * w + 0.02 * noise[k], 0.5 * x[1] + 0.4 * x[0]])
+    return Record(u, y, name="record", start="estimated" if integrates else "zero")
+
+
+def kept(model: Model) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    cell = model.lfr.cell
+    return {name: (mask, cell.get_parameter(name)[mask]) for name, mask in cell.held.items()}
+
+
+def identified(record: Record, **options: Any) -> lfrtorch.Run:
+    base: dict[str, Any] = {"nx": 2, "nz": 1, "nw": 1, "nn": 3, "starts": 1, "trainer": SEARCH}
+    settings = Settings(**base | options)
+    return identify(lfrtorch.Dataset("lag", [record[:300]], [record[300:]], []), settings)
+
+
+def check_zeros(model: Model, *names: str) -> None:
+    for name in names:
+        mask = model.lfr.cell.held[name]
+        assert mask.any()
+        assert not model.lfr.cell.get_parameter(name)[mask].any(), name
+
+
+@pytest.mark.parametrize("guarantee", [None, "stable", "contracting"])
+@pytest.mark.parametrize("structure", ["hammerstein", "wiener_hammerstein"])
+def test_a_structure_with_given_entries(structure: str, guarantee: Any, tmp_path: Path):
+    nx = 2 if structure == "hammerstein" else 4
+    row = [[0.7] + [FREE] * (nx - 1)]
+    run = identified(
+        saturating(), structure=structure, fixed={"Cy": row},
+        trainer=LevenbergMarquardt(max_iter=4, guarantee=guarantee),
+    )  # fmt: skip
+    model = run.model
+    check_zeros(model, *({"Cz"} if structure == "hammerstein" else {"A", "Bu", "Bw", "Cz"}))
+    Cy = model.scaler.y_scale[0] * model.lfr.cell.Cy[0, 0].item()
+    assert Cy == pytest.approx(0.7, rel=1e-12)
+    errors = [one.train for one in run.fit.history]
+    assert errors[-1] < errors[0]
+    again = lfrtorch.load(model.save(tmp_path / "model"))
+    assert again.net_parameter_count == model.net_parameter_count < model.parameter_count
+    assert {n: m.tolist() for n, m in again.lfr.cell.held.items()} == {
+        n: m.tolist() for n, m in model.lfr.cell.held.items()
+    }
+
+
+def test_integrators_with_given_entries():
+    linear = {"integrators": 1}
+    fixed = {"A": [[0.8, FREE], [FREE, FREE]]}
+    run = identified(saturating(integrates=True), fixed=fixed, linear=linear)
+    cell = run.model.lfr.cell
+    assert integrating_states(cell).tolist() == [False, True]
+    assert cell.A[0, 0].item() == 0.8
+    assert run.fit.history[-1].train < run.fit.history[0].train
+
+
+@pytest.mark.parametrize(
+    ("options", "names"),
+    [
+        ({"structure": "hammerstein"}, {"Cz"}),
+        ({"structure": "wiener_hammerstein"}, {"A", "Bu", "Bw", "Cz"}),
+        ({"fixed": {"A": [[0.8, FREE], [FREE, FREE]], "Bu": [[FREE], [0.0]]}}, {"A", "Bu"}),
+        ({"z_feedthrough": False}, {"Dzu"}),
+    ],
+)
+@pytest.mark.parametrize("trainer", [SEARCH, lfrtorch.Adam(max_iter=20)])
+def test_innovations_keep_what_the_system_holds(options: Any, names: set[str], trainer: Any):
+    """A, Bu and Bw of a predictor change with K, and those of its system do not."""
+    run = identified(saturating(), noise="innovation", **options, trainer=trainer)
+    model, errors = run.model, [one.train for one in run.fit.history]
+    assert model.K is not None
+    assert model.K.any()
+    assert {*model.lfr.cell.held} == names
+    assert min(errors) < errors[0]
+    if "fixed" in options:
+        assert model.lfr.cell.A[0, 0].item() == 0.8
+        assert model.lfr.cell.Bu[1, 0].item() == 0.0
+    else:
+        check_zeros(model, *names)
+
+
+@pytest.mark.parametrize("structure", ["wiener", "hammerstein", "wiener_hammerstein", "parallel"])
+def test_a_mean_keeps_a_structure(structure: str):
+    """Its w does not come back to its z: a first-order change of w leaves z as it is."""
+    sizes = {"nz": 2, "nw": 2, "nn": 4} if structure == "parallel" else {}
+    run = identified(saturating(), structure=structure, starts=3, average=3, refit=True, **sizes)
+    models = run.fit.members or [run.model]
+    mean = lfrtorch.mean_model([*models, models[0]])
+    refitted = lfrtorch.fit(mean, saturating(), trainer=SEARCH, monitors=[]).model
+    A, _, Bw, Cz = (m for m in refitted.lfr.cell.matrices()[:4])
+    markov = [Cz @ np.linalg.matrix_power(A, k) @ Bw for k in range(4)]
+    assert max(np.abs(part).max() for part in markov) < 1e-12 or structure == "hammerstein"
+    if structure == "hammerstein":
+        assert not Cz.any()
+    if structure == "parallel":
+        Wz = refitted.lfr.cell.get_parameter("static.Wz")
+        assert ((Wz != 0).sum(dim=1) <= 1).all()
+
+
+def test_what_is_held_at_two_values_is_refused():
+    with pytest.raises(InputError, match=r"Bw\[0, 0\] is held at 0, and .* holds it at 0.5"):
+        identified(saturating(), structure="wiener", fixed={"Bw": [[0.5], [FREE]]})
+
+
+# --- settings that were apart because of how each was made --------------------------------------
+
+
+def test_driven_states_stand_behind_a_static_map():
+    """Of blocks in series they belong to the second one: z does not see them."""
+    run = identified(saturating(), structure="wiener_hammerstein", relaxations=1)
+    cell = run.model.lfr.cell
+    assert cell.nx == 2 + 2 + 1
+    assert cell.A[4, 4] > 0
+    check_zeros(run.model, "A", "Bu", "Bw", "Cz")
+    assert cell.held["Cz"][0].tolist() == [False, False, True, True, True]
+    assert run.fit.history[-1].train < run.fit.history[0].train
+
+
+@pytest.mark.parametrize("structure", ["hammerstein", "parallel"])
+def test_sizes_of_a_structure_are_searched(structure: str):
+    sizes = {"nz": "auto", "nw": "auto"} if structure == "hammerstein" else {"nz": 2, "nw": 2}
+    run = identified(saturating(), structure=structure, nn="auto", **sizes, starts=2)
+    assert run.choice is not None
+    assert len(run.choice.candidates) > 1
+    check_zeros(run.model, "Cz")
+
+
+def test_sizes_are_searched_with_given_entries():
+    run = identified(saturating(), fixed={"Cy": [[0.7, FREE]]}, nn="auto", starts=2)
+    Cy = run.model.scaler.y_scale[0] * run.model.lfr.cell.Cy[0].detach() * run.fit.averaged
+    assert Cy[0].item() == pytest.approx(0.7, rel=1e-9)
+
+
+class Cube(torch.nn.Module):
+    """A map of one's own: w = W z³."""
+
+    def __init__(self, nz: int, nw: int) -> None:
+        super().__init__()
+        self.W = torch.nn.Parameter(torch.zeros(nw, nz, dtype=torch.float64))
+
+    def forward(self, z: torch.Tensor) -> torch.Tensor:
+        return z.pow(3) @ self.W.mT
+
+
+def test_sizes_of_a_map_of_ones_own_are_searched():
+    run = identified(saturating(), static=Cube, nz="auto", nw="auto", starts=1)
+    assert run.choice is not None
+    assert {*run.choice.chosen.sizes} == {"nx", "nz", "nw"}
+
+
+def test_predictions_are_fitted_in_windows():
+    run = identified(saturating(), noise="innovation", horizon=50)
+    assert run.model.K is not None
+    assert run.fit.history[-1].train < run.fit.history[0].train
+
+
+def test_the_starts_of_a_mean_begin_on_a_part():
+    run = identified(saturating(), first_part=0.5, first_iterations=3, starts=3, average=3)
+    assert len(run.fit.starts) == run.fit.averaged == len(run.fit.members) or not run.fit.members
+
+
+def lag(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+    return (p.a * x.h + 0.4 * u[0],)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"noise": "innovation"},
+        {"init": "paper"},
+        {"z_feedthrough": False},
+        {"static": Cube, "nn": 0},
+    ],
+    ids=str,
+)
+def test_what_stands_beside_known_equations(options: dict[str, Any]):
+    known = lfrtorch.Known(lag, states=["h"], parameters={"a": 0.6}, method="discrete")
+    run = identified(saturating(), **{"known": known, "nx": 1, "nn": 3} | options)
+    model, cell = run.model, run.model.lfr.cell
+    assert run.fit.history[-1].train < run.fit.history[0].train
+    assert cell.Cz[0, 0].item() == cell.Bw[0, 0].item() == 1.0
+    if "noise" in options:
+        assert model.K is not None
+        assert model.K.any()
+    if "z_feedthrough" in options:
+        assert not cell.Dzu[2:].any()
+        assert cell.Dzu[1, 0].item() == 1.0
