@@ -71,7 +71,7 @@ def measured(folder: Path, name: str) -> int:
     with connect() as ranks:
         ranks.sum(torch.ones(1))
         begun = time.perf_counter()
-        lfrtorch.fit(models, data, trainer=trainer, ranks=ranks, monitors=[[]] * len(models))
+        lfrtorch.fit(models, data, trainer=trainer, monitors=[[]] * len(models))
         if ranks.rank == 0:
             print(time.perf_counter() - begun)
     return 0

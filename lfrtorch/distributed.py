@@ -2,17 +2,18 @@
 
     torchrun --nproc-per-node 2 script.py
 
-with ``with connect() as ranks: fit(..., ranks=ranks)`` in the script: gloo between CPUs, NCCL
-between GPUs. ``Ranks.sharing_records`` decides what is shared. All processes take the same steps,
-for what decides is a sum over all of them or the first one's: rounding errors differ from one kind
-of processor to another, and a search lets them grow.
+with ``with connect(): fit(...)`` in the script: gloo between CPUs, NCCL between GPUs. Within it
+``current()`` has the processes, whoever asks. ``Ranks.sharing_records`` decides what is shared. All
+processes take the same steps, for what decides is a sum over all of them or the first one's:
+rounding errors differ from one kind of processor to another, and a search lets them grow.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from typing import Self, TypeVar
 
@@ -76,10 +77,36 @@ class Ranks:
         """Leave the other processes: what they share from now on ends in a ``ProcessLostError``."""
 
     def __enter__(self) -> Self:
+        _CURRENT.append(self)
         return self
 
     def __exit__(self, *error: object) -> None:
+        _CURRENT.pop()
         self.close()
+
+
+_CURRENT = [Ranks()]
+"""The processes that work together now, last; those before wait for them."""
+
+
+def current() -> Ranks:
+    """The processes that work together now: those of the last ``connect``, or this one alone."""
+    return _CURRENT[-1]
+
+
+@contextmanager
+def using(ranks: Ranks | None) -> Iterator[Ranks]:
+    """Let other processes work together meanwhile; with None it stays as it is."""
+    _CURRENT.append(current() if ranks is None else ranks)
+    try:
+        yield current()
+    finally:
+        _CURRENT.pop()
+
+
+def agreed(part: Tensor) -> Tensor:
+    """The numbers of the first process, on each of those that work together."""
+    return current().first(part)
 
 
 def connect(device: str | torch.device = "cpu", timeout: float = 600.0) -> Ranks:
@@ -96,9 +123,8 @@ def connect(device: str | torch.device = "cpu", timeout: float = 600.0) -> Ranks
 
     Example:
         >>> with lfrtorch.distributed.connect() as ranks:  # alone: no torchrun
-        ...     result = lfrtorch.fit(
-        ...         model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=2), ranks=ranks
-        ...     )
+        ...     trainer = lfrtorch.LevenbergMarquardt(max_iter=2)
+        ...     result = lfrtorch.fit(model, record, trainer=trainer)
         >>> ranks.rank, ranks.world
         (0, 1)
     """

@@ -19,7 +19,7 @@ from lfrtorch._support.tables import number, percent, quantity
 from lfrtorch._support.threads import each_alone
 from lfrtorch.analysis.physical_parameters import physical_parameters
 from lfrtorch.dataset import Dataset
-from lfrtorch.distributed import Ranks
+from lfrtorch.distributed import Ranks, agreed, using
 from lfrtorch.files.split import cut
 from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.exclusions import allowed
@@ -130,11 +130,11 @@ def identify(
         True
     """
     dataset = _by_use(dataset)
-    ranks = Ranks() if ranks is None else ranks
-    if observer is None:
-        observer = LineObserver() if ranks.rank == 0 else Observer()
-    with closing(observer):
-        return _identified(Stage(dataset, settings, observer, ranks, stop), snapshots)
+    with using(ranks) as all_of_them:
+        if observer is None:
+            observer = LineObserver() if all_of_them.rank == 0 else Observer()
+        with closing(observer):
+            return _identified(Stage(dataset, settings, observer, stop), snapshots)
 
 
 def _by_use(given: Any) -> Dataset:
@@ -179,7 +179,7 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     else:
         approximated = linear_records(dataset.train, linearly, observer)
         linear, order_scan = linear_model(
-            approximated, linearly, dataset.validation, observer=observer, ranks=given.ranks
+            approximated, linearly, dataset.validation, observer=observer
         )
     begun = linear
     choice = None
@@ -424,7 +424,6 @@ def linear_model(
     validation: Sequence[Record] = (),
     *,
     observer: Observer,
-    ranks: Ranks,
 ) -> tuple[LinearModel, OrderScan | None]:
     """The best linear approximation, and the scan that chose its order if nx is ``"auto"``."""
     if not isinstance(data, FRF) and not data:
@@ -441,7 +440,7 @@ def linear_model(
         for note in scan.notes:
             observer.say(f"note: {note}")
         # Rounding may differ from machine to machine, and the order must not.
-        chosen = int(ranks.first(torch.tensor(scan.chosen)))
+        chosen = int(agreed(torch.tensor(scan.chosen)))
         linear = scan.models[scan.orders.index(chosen)]
     else:
         linear = estimate_bla(data, cast(int, settings.nx), **settings.linear)
@@ -510,7 +509,6 @@ def _choice(stage: Stage, linear: LinearModel, scan: OrderScan | None) -> Choice
         seed=settings.seed,
         guarantee="stable" if settings.trainer.guarantee == "stable" else None,
         watch=observer.say,
-        ranks=stage.ranks,
         stop=stage.stop,
     )
     observer.say(choice.table())

@@ -28,14 +28,14 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from lfrtorch._support.reasons import Reason
 from lfrtorch.cli.command import start as start_command
 from lfrtorch.dataset import Dataset
-from lfrtorch.distributed import ProcessLostError, Ranks, connect
+from lfrtorch.distributed import ProcessLostError, Ranks, connect, using
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import FitResult, Progress
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
-from lfrtorch.least_squares.problem import Problem
+from lfrtorch.least_squares.shared_problem import problem_of
 from lfrtorch.model import Model, load
 from lfrtorch.records import Record
 from lfrtorch.reporting.monitor import Checkpoint
@@ -167,7 +167,8 @@ def fitted(name: str, ranks: Ranks) -> tuple[Tensor, FitResult]:
 def slope(ranks: Ranks) -> dict[str, Any]:
     """Cost, gradients and error of the start."""
     model, train, _ = case()
-    problem = Problem.of(model, train, ridge=1e-2, ranks=ranks)
+    with using(ranks):
+        problem = problem_of(model, train, ridge=1e-2)
     at = problem.theta + 0.01
     point, gradient = problem.gradient(at)
     system, product = problem.linearise(at).system(0.0, 1e-12)

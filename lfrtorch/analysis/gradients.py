@@ -15,7 +15,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lfrtorch.analysis.noise_model import NoiseModel
-from lfrtorch.distributed import Ranks
 from lfrtorch.engine.sensitivity import Linearisation, fixed_point
 from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator
 from lfrtorch.least_squares.record_groups import RecordGroup
@@ -49,7 +48,6 @@ class Gradients:
         errors = SimulationErrors(
             model.lfr.cell,
             [model.scaler.normalise(record)],
-            Ranks(),
             solve_initial_states=not fitted,
         )
         self.record, self.kept = record, kept

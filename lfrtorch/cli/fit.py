@@ -48,7 +48,7 @@ from lfrtorch.cli.run_folder import (
     world,
 )
 from lfrtorch.dataset import Dataset
-from lfrtorch.distributed import ProcessLostError, Ranks, connect
+from lfrtorch.distributed import ProcessLostError, connect, current
 from lfrtorch.fitting.observer import Watching
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.snapshots import Snapshots
@@ -62,26 +62,23 @@ from lfrtorch.reporting.run_files import write
 from lfrtorch.reporting.verdict import LINEAR_MODEL
 
 
-def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = None) -> float:
+def run(cfg: DictConfig, folder: Path, command: str = "") -> float:
     """One run, its files written by the first process; returns the validation RMSE."""
     # A fit that ended early has its files written before the error of that.
-    ranks = Ranks() if ranks is None else ranks
+    first = current().rank == 0
     cfg = chosen_before(cfg, folder)
     settings = configured(cfg)
     limit_threads(cfg)
     dataset = loaded(cfg)
-    if cfg.resume is None and ranks.rank == 0:
+    if cfg.resume is None and first:
         for old in (SNAPSHOTS, STARTS):
             shutil.rmtree(folder / old, ignore_errors=True)
-    kept = folder / SNAPSHOTS if cfg.resume or ranks.rank == 0 else None
-    snapshots = Snapshots(kept, writes=ranks.rank == 0)
-    first = ranks.rank == 0
+    kept = folder / SNAPSHOTS if cfg.resume or first else None
+    snapshots = Snapshots(kept, writes=first)
     files = _Folder(cfg, folder, least=snapshots.least) if first else None
     with Termination() as stop, resumable(folder):
         try:
-            found = identify(
-                dataset, settings, observer=files, snapshots=snapshots, ranks=ranks, stop=stop
-            )
+            found = identify(dataset, settings, observer=files, snapshots=snapshots, stop=stop)
         except StoppedError as stopped:
             number = stop.asked or signal.SIGINT
             raise TerminatedError(f"{stopped}: nothing to keep", number) from None
@@ -180,10 +177,9 @@ def launched(cfg: DictConfig, folder: Path, command: str) -> float:
         stack.enter_context(quiet_writers())
         if rank == "0":
             stack.enter_context(no_empty_folder(folder))
-        ranks = stack.enter_context(connect(cfg.device, cfg.timeout))
-        if ranks.rank > 0:
+        if stack.enter_context(connect(cfg.device, cfg.timeout)).rank > 0:
             stack.enter_context(redirect_stdout(stack.enter_context(open(os.devnull, "w"))))
-        return run(cfg, common(folder, ranks), command, ranks)
+        return run(cfg, common(folder), command)
     raise AssertionError  # user_errors does not return
 
 

@@ -22,7 +22,6 @@ from lfrtorch.cli.composition import started
 from lfrtorch.cli.config import configured, limit_threads, loaded
 from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.cli.run_folder import CONFIG, arguments, no_empty_folder, program
-from lfrtorch.distributed import Ranks
 from lfrtorch.job import linear_model, linear_records
 from lfrtorch.linear.requirements import of_response
 from lfrtorch.reporting import linear_report
@@ -41,7 +40,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     terminal = Console()
     data = frf if frf and wants_response(cfg, dataset.train) else None
     data = data or linear_records(dataset.train, settings, terminal)
-    model, scan = linear_model(data, settings, dataset.validation, observer=terminal, ranks=Ranks())
+    model, scan = linear_model(data, settings, dataset.validation, observer=terminal)
     cfg.nx = model.nx
     assert model.fit is not None
     for note in notes:

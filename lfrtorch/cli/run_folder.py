@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.paths import expanded
-from lfrtorch.distributed import Ranks
+from lfrtorch.distributed import agreed
 
 CONFIG, SNAPSHOTS, STARTS = "config.yaml", "resume", "starts"
 """In the folder of a run: its settings, its starts as far as they came, and events of those that go
@@ -128,10 +128,10 @@ def resumable(folder: Path) -> Iterator[None]:
         raise OSError(f"{error}; {go_on(folder)}") from error
 
 
-def common(folder: Path, ranks: Ranks) -> Path:
+def common(folder: Path) -> Path:
     """The first process's folder."""
     name = torch.tensor(list(str(folder).encode()), dtype=torch.uint8)
-    return Path(bytes(ranks.first(name).tolist()).decode())
+    return Path(bytes(agreed(name).tolist()).decode())
 
 
 @contextmanager

@@ -45,7 +45,7 @@ from lfrtorch._support.tables import percent, quantity, radius
 from lfrtorch._support.threads import each_alone, worth_threads
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
-from lfrtorch.distributed import Ranks
+from lfrtorch.distributed import agreed
 from lfrtorch.fitting.folds import Fold, as_folded, folds
 from lfrtorch.fitting.forgetting import forgets
 from lfrtorch.fitting.side_by_side import any_of
@@ -212,7 +212,6 @@ def choose_sizes(
     seed: int = 0,
     guarantee: Name | None = None,
     watch: Callable[[str], None] = lambda _: None,
-    ranks: Ranks | None = None,
     stop: Stop | None = None,
 ) -> Choice:
     """Choose sizes and ridge of an NL-LFR by cross-validation.
@@ -230,7 +229,6 @@ def choose_sizes(
         seed: of the first start; the second has seed + 1000.
         guarantee: of the trainer.
         watch: called with a line after each size.
-        ranks: processes that must agree; each does all of the work.
         stop: asked before each iteration.
 
     Raises:
@@ -251,7 +249,6 @@ def choose_sizes(
     integer("seed", seed, 0)
     if last not in _SMALL[0]:
         raise InputError(f"last is '{last}'; give one of {', '.join(_SMALL[0])}.")
-    ranks = Ranks() if ranks is None else ranks
     halt = Event()
     path = [(ridge, sum(count for _, count in _RIDGES))] if ridge != 0.0 else _RIDGES
     folded = as_folded(as_records(records))
@@ -283,7 +280,7 @@ def choose_sizes(
 
     def leader() -> Candidate | None:
         finite = [c for c in tried if isfinite(c.ratio)]
-        ratios = ranks.first(torch.tensor([c.ratio for c in finite], dtype=torch.float64))
+        ratios = agreed(torch.tensor([c.ratio for c in finite], dtype=torch.float64))
         return finite[int(ratios.argmin())] if finite else None
 
     names = ("nz", "nw", last)
@@ -318,10 +315,8 @@ def choose_sizes(
         )
     counts, base = study.counts, study.best_linear()
     tried = [replace(c, ratio=sqrt(c.squares.sum() / base.total)) for c in tried]
-    chosen = _chosen(tried, range(FOLDS), counts, ranks)
-    nested = [
-        _chosen(tried, [j for j in range(FOLDS) if j != k], counts, ranks) for k in range(FOLDS)
-    ]
+    chosen = _chosen(tried, range(FOLDS), counts)
+    nested = [_chosen(tried, [j for j in range(FOLDS) if j != k], counts) for k in range(FOLDS)]
     both = [base.outputs, [each.outputs[k] for k, each in enumerate(nested)]]
     seconds = time.perf_counter() - clock
     left_out = study.whole(both)
@@ -356,12 +351,10 @@ def _larger(sizes: Sizes, given: Mapping[str, int], last: str) -> Iterator[Sizes
         yield {**sizes, **{name: size for name, size in change.items() if name not in given}}
 
 
-def _chosen(
-    tried: Sequence[Candidate], of: Sequence[int], counts: Integers, ranks: Ranks
-) -> Candidate:
+def _chosen(tried: Sequence[Candidate], of: Sequence[int], counts: Integers) -> Candidate:
     """Return the fewest parameters that do as well as the best in some folds."""
     squares = np.array([c.squares[list(of)].ravel() for c in tried])
-    squares = ranks.first(torch.from_numpy(squares)).numpy()
+    squares = agreed(torch.from_numpy(squares)).numpy()
     blocks = counts[list(of)].ravel()
     sizes: dict[tuple[int, ...], list[int]] = {}
     for i, candidate in enumerate(tried):
@@ -529,7 +522,7 @@ class _Study:
             if id(record) not in judges:
                 own = [model.scaler.normalise(record)]
                 cell = model.lfr.cell
-                judge = SimulationErrors(cell, own, Ranks(), solve_initial_states=True)
+                judge = SimulationErrors(cell, own, solve_initial_states=True)
                 judges[id(record)] = judge, None
             judge, near = judges[id(record)]
             _, seen = judge.evaluate(theta[: judge.parameters.own], near)

@@ -9,6 +9,7 @@ from typing import Any
 
 from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch._support.tables import quantity
+from lfrtorch.distributed import current
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Stage
@@ -25,7 +26,7 @@ def begun_on_part(stage: Stage, models: list[Model]) -> tuple[Settings, list[Mod
     train = dataset.train
     part = first_records(stage)
     samples, all_samples = (sum(r.samples for r in records) for records in (part, train))
-    if max(len(models), len(part)) < stage.ranks.world or samples == all_samples:
+    if max(len(models), len(part)) < current().world or samples == all_samples:
         observer.say(
             f"note: first_part is {settings.first_part}, and there are {len(train)} training "
             "record(s): all are fitted from the first iteration"

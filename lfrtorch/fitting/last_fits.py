@@ -11,6 +11,7 @@ import torch
 from lfrtorch._support.reasons import CUT_SHORT, Reason
 from lfrtorch._support.tables import quantity
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
+from lfrtorch.distributed import agreed
 from lfrtorch.fitting.first_fit import cost_in_full
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.prediction import predicting
@@ -36,7 +37,7 @@ def without_poor_starts(stage: Stage, result: FitResult) -> FitResult:
     assert isinstance(models, list)
     judges = [Problem.judge(model, train) for model in models]
     costs = torch.tensor([j.evaluate(j.theta).cost for j in judges], dtype=torch.float64)
-    costs = stage.ranks.first(costs.nan_to_num(torch.inf))  # the simulation of some may run away
+    costs = agreed(costs.nan_to_num(torch.inf))  # the simulation of some may run away
     near = int((costs <= _POOR**2 * costs.min()).sum())
     if near == len(result.members):
         return result
@@ -78,7 +79,7 @@ def refitted(stage: Stage, result: FitResult) -> tuple[FitResult, FitResult | No
     margins = torch.tensor(
         [largest_stable_amplitude(m, records) for m in (again.model, result.model)]
     )
-    if bool(torch.lt(*stage.ranks.first(margins))):
+    if bool(torch.lt(*agreed(margins))):
         observer.say(
             "note: refit: the model would become unstable on louder inputs; that before it stays"
         )

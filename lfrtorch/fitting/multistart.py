@@ -38,12 +38,12 @@ from lfrtorch._support.reasons import CUT_SHORT, Reason, told
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.analysis.static_slopes import infinite_slope
-from lfrtorch.distributed import Ranks
+from lfrtorch.distributed import Ranks, current, using
 from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.forgetting import forgets
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.means import mean_model
-from lfrtorch.fitting.over_processes import OverProcesses, same_weights
+from lfrtorch.fitting.over_processes import OverProcesses
 from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.fitting.prediction import (
     predicting,
@@ -67,6 +67,7 @@ from lfrtorch.fitting.trainer import (
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
+from lfrtorch.least_squares.shared_problem import same_weights
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, common_unit
 from lfrtorch.score_window import with_window
@@ -147,10 +148,10 @@ def fit(
             those that print or write files to the first alone. Default: a line on a terminal or in
             a notebook, and nothing elsewhere; ``[]`` for nothing at all.
         watch: called after each round.
-        ranks: the processes that share starts or training records, ``distributed.connect()``; each
-            calls this function with the same arguments, starts from the first one's weights and
-            returns the same fit. Of starts that others fit, monitors see the best and the last
-            iterate of a round.
+        ranks: the processes that share starts or training records. Default: those of a
+            ``with distributed.connect():`` around the call. Each calls this function with the same
+            arguments, starts from the first one's weights and returns the same fit. Of starts that
+            others fit, monitors see the best and the last iterate of a round.
         snapshots: where the starts are kept as far as they came. They go on from there, to the
             same end as if they had not been interrupted (on the same machine).
         stop: asked before each iteration; the fit ends there if it returns True, for example
@@ -187,16 +188,16 @@ def fit(
         "trainer": LevenbergMarquardt() if trainer is None else trainer,
         "ridge": ridge,
         "horizon": horizon,
-        "ranks": Ranks() if ranks is None else ranks,
         "stop": stop,
     }
     found = partial(_fitted, average=average, watch=watch, snapshots=snapshots, options=options)
     models = models if isinstance(models, Model) else _different(models)
-    if noise == "output":
-        models = without_gain(models)
-        return found(models, train, validation, selection, monitors=monitors)
-    starts, *data = predicting(models, train, validation, selection)
-    result = found(starts, *data, monitors=shown_innovation_form(monitors))
+    with using(ranks):
+        if noise == "output":
+            models = without_gain(models)
+            return found(models, train, validation, selection, monitors=monitors)
+        starts, *data = predicting(models, train, validation, selection)
+        result = found(starts, *data, monitors=shown_innovation_form(monitors))
     members = tuple(model.innovation_form() for model in result.members)
     return replace(result, model=result.model.innovation_form(), members=members)
 
@@ -245,17 +246,18 @@ def _fitted(
     clock = time.perf_counter()
     snapshots = Snapshots() if snapshots is None else snapshots
     halt = Event()
-    ranks, stop, train = options["ranks"], options["stop"], as_records(train)
+    stop, train = options["stop"], as_records(train)
     planned = schedule(len(starts), options["trainer"].limit, average)
-    sharing = ranks.sharing_records(len(starts))
-    spread = sharing.world < ranks.world
-    own = {"ranks": sharing, "stop": any_of(halt, stop) if sharing.world == 1 else stop}
+    sharing = current().sharing_records(len(starts))
+    spread = sharing.world < current().world
+    own = {"stop": any_of(halt, stop) if sharing.world == 1 else stop}
     if spread:
-        same_weights(starts, ranks)
-    fits = [
-        Fit(model, train, validation, **{**options, **own}, keep=snapshots.keeper(number))
-        for number, model in enumerate(starts)
-    ]
+        same_weights(starts)
+    with using(sharing):
+        fits = [
+            Fit(model, train, validation, **{**options, **own}, keep=snapshots.keeper(number))
+            for number, model in enumerate(starts)
+        ]
     if all(one.diverges for one in fits):
         which = "the model diverges" if len(fits) == 1 else "all models diverge"
         raise StartDivergesError(
@@ -267,14 +269,14 @@ def _fitted(
     unseen = [*validation, *selection]
     field, cut = fits, None
     with ExitStack() as ending:
-        if monitors is None and ranks.rank == 0:
+        if monitors is None and current().rank == 0:
             line = line_of(starts, planned)
             watching = [[line]] * len(starts)
             ending.callback(line.close)
         watching = watching or [()] * len(fits)
         if spread:
             together: Together = OverProcesses(
-                fits, watching, halt, ranks=ranks, stop=any_of(halt, stop), take=snapshots.take
+                fits, watching, halt, stop=any_of(halt, stop), take=snapshots.take
             )
         else:
             together = Together(fits, watching, halt)
@@ -444,7 +446,7 @@ class _Judge:
 
     def _same(self, numbers: list[float]) -> Tensor:
         """Return the numbers of the first process."""
-        return self._together.ranks.first(torch.tensor(numbers, dtype=torch.float64))
+        return self._together.agreed(torch.tensor(numbers, dtype=torch.float64))
 
 
 def _cost(error: Problem) -> float:

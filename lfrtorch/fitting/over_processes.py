@@ -15,12 +15,12 @@ from tempfile import TemporaryDirectory
 from threading import Event
 
 import torch
+from torch import Tensor
 
 from lfrtorch._support.reasons import Reason
-from lfrtorch.distributed import ProcessLostError, Ranks
+from lfrtorch.distributed import ProcessLostError, Ranks, current
 from lfrtorch.fitting.side_by_side import Together
 from lfrtorch.fitting.trainer import Fit, Monitor, Stop
-from lfrtorch.model import Model
 
 SHORT, LONG = 10.0, 60.0
 """Seconds of a leg: shorter ones get twice the iterations, longer ones half of them, as a process
@@ -28,14 +28,6 @@ that waits longer than its timeout takes the others for lost."""
 
 Take = Callable[[int, bytes], None]
 """Called with the number of a start and the state of its fit, as ``Fit.save`` writes it."""
-
-
-def same_weights(models: Sequence[Model], ranks: Ranks) -> None:
-    """Give all processes the weights of the first one's models."""
-    with torch.no_grad():
-        for model in models if ranks.world > 1 else ():
-            for p in model.lfr.parameters():
-                p.copy_(ranks.first(p.detach()))
 
 
 class OverProcesses(Together):
@@ -51,15 +43,18 @@ class OverProcesses(Together):
         monitors: Sequence[Sequence[Monitor]],
         halt: Event,
         *,
-        ranks: Ranks,
         stop: Stop,
         take: Take,
     ) -> None:
         super().__init__(fits, monitors, halt)
-        self.ranks, self._stop, self._take = ranks, stop, take
+        self.ranks, self._stop, self._take = current(), stop, take
         self._numbers = {id(fit): number for number, fit in enumerate(fits)}
         self._stride = 1
         self._states: dict[int, bytes] = {}
+
+    def agreed(self, numbers: Tensor) -> Tensor:
+        """Numbers that decide: those of the first process."""
+        return self.ranks.first(numbers)
 
     def advance(self, fits: Sequence[Fit], until: int) -> None:
         """Go on with some of them to an iteration, each process with its share."""

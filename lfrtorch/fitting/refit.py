@@ -19,7 +19,7 @@ import numpy as np
 
 from lfrtorch._support.arguments import typed
 from lfrtorch.dataset import Dataset
-from lfrtorch.distributed import Ranks
+from lfrtorch.distributed import current, using
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.fitting.trainer import FitResult, Monitor, Stop, Trainer
@@ -40,7 +40,6 @@ def refit(
     horizon: int | None = None,
     iterations: int | None = None,
     monitor: Monitor | None = None,
-    ranks: Ranks | None = None,
     stop: Stop | None = None,
 ) -> FitResult:
     """Go on with a fit on its training records and those that were held out to choose.
@@ -56,7 +55,7 @@ def refit(
         trainer, ridge, noise, horizon: of the fit; ridge pulls towards the model that was chosen.
         iterations: that were chosen. Default: those of the fit, without what came before it.
         monitor: called after every iteration. Default: a line on a terminal or in a notebook.
-        ranks, stop: see :func:`lfrtorch.fit`.
+        stop: see :func:`lfrtorch.fit`.
 
     Returns:
         The fit to all records; that of the models as they are if no iteration was chosen.
@@ -83,20 +82,18 @@ def refit(
     limit = min(ceil(chosen * new / seen), base.limit)
     models = [deepcopy(model) for model in result.members or (result.model,)]
     records = all_records(train, held_out)
-    if ranks is not None:
-        ranks = ranks.enough_for(max(len(models), len(records)))
-    return fit(
-        models,
-        records,
-        trainer=replace(base, max_iter=limit),
-        ridge=ridge,
-        noise=noise,
-        horizon=horizon,
-        average=len(models),
-        monitors=None if monitor is None else [[monitor]] * len(models),
-        ranks=ranks,
-        stop=stop,
-    )
+    with using(current().enough_for(max(len(models), len(records)))):
+        return fit(
+            models,
+            records,
+            trainer=replace(base, max_iter=limit),
+            ridge=ridge,
+            noise=noise,
+            horizon=horizon,
+            average=len(models),
+            monitors=None if monitor is None else [[monitor]] * len(models),
+            stop=stop,
+        )
 
 
 def estimation_records(dataset: Dataset) -> list[Record]:

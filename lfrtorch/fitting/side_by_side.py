@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from functools import partial
 from threading import Event, Lock
 
+from torch import Tensor
+
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.threads import each_alone, worth_threads
 from lfrtorch.fitting.trainer import Fit, Monitor, Progress, Stop
@@ -23,20 +25,23 @@ class Together:
     def __init__(
         self, fits: Sequence[Fit], monitors: Sequence[Sequence[Monitor]], halt: Event
     ) -> None:
-        self.ranks = fits[0].ranks
-        """The processes that all decide with."""
+        self._first = fits[0]
         self._halt, self._one = halt, Lock()
         self._monitors = {
             id(fit): [self._in_turn(monitor) for monitor in own]
             for fit, own in zip(fits, monitors, strict=True)
         }
 
+    def agreed(self, numbers: Tensor) -> Tensor:
+        """Numbers that decide: those of the first process."""
+        return self._first.problem.agreed(numbers)
+
     def advance(self, fits: Sequence[Fit], until: int) -> None:
         """Go on with some of them to an iteration."""
         first = fits[0]
         theta = first.problem.theta
         threads = worth_threads(first.problem.size, len(theta))
-        alone = first.ranks.world == 1 and theta.device.type == "cpu"
+        alone = not first.problem.shared and theta.device.type == "cpu"
         try:
             if len(fits) > 1 and alone:
                 advance = partial(self._advance_one, until=until)

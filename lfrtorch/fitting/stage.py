@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TypedDict, cast
 
 from lfrtorch.dataset import Dataset
-from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.fitting.settings import Settings
@@ -21,7 +20,6 @@ class FitOptions(TypedDict):
     ridge: Ridge
     noise: Noise
     horizon: int | None
-    ranks: Ranks
     stop: Stop | None
 
 
@@ -32,7 +30,6 @@ class Stage:
     dataset: Dataset
     settings: Settings
     observer: Observer
-    ranks: Ranks
     stop: Stop | None
 
     @property
@@ -43,6 +40,5 @@ class Stage:
             "ridge": cast(Ridge, self.settings.ridge),  # chosen before a fit begins
             "noise": self.settings.noise,
             "horizon": self.settings.horizon,
-            "ranks": self.ranks,
             "stop": self.stop,
         }

@@ -17,7 +17,7 @@ from torch import Tensor
 from lfrtorch._support.errors import InputError, LfrtorchError
 from lfrtorch._support.reasons import Reason, told
 from lfrtorch._support.threads import spread_by_hand
-from lfrtorch.distributed import ProcessLostError, Ranks
+from lfrtorch.distributed import ProcessLostError
 from lfrtorch.fitting import state_file
 from lfrtorch.fitting.fit_state import FitState, Progress
 from lfrtorch.fitting.windows import windows
@@ -25,6 +25,7 @@ from lfrtorch.least_squares.guarantee import Name
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, Point
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
+from lfrtorch.least_squares.shared_problem import problem_of
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
@@ -182,16 +183,11 @@ class Fit:
         trainer: Trainer | None = None,
         ridge: Ridge = 0.0,
         horizon: int | None = None,
-        ranks: Ranks | None = None,
         keep: Keep = lambda fit, paused: None,
         stop: Stop | None = None,
     ) -> None:
         self.model, self.keep, self._stop = model, keep, stop
         self.trainer = LevenbergMarquardt() if trainer is None else trainer
-        self.ranks = ranks = Ranks() if ranks is None else ranks
-        with torch.no_grad():
-            for p in model.lfr.parameters() if ranks.world > 1 else ():
-                p.copy_(ranks.first(p.detach()))
         guarantee = self.trainer.guarantee
         longest = max(record.samples for record in as_records(train))
         if horizon is not None:
@@ -200,9 +196,7 @@ class Fit:
             train = cut(as_records(train))
             if validation:
                 validation = cut(as_records(validation), fitted=False)
-        self.problem = Problem.of(
-            model, train, ridge=ridge, guarantee=guarantee, longest=longest, ranks=ranks
-        )
+        self.problem = problem_of(model, train, ridge=ridge, guarantee=guarantee, longest=longest)
         self.judge = Problem.judge(model, validation) if validation else None
         self.at: FitState | None = None
         """Where it stands; None before the first call of ``advance``."""
@@ -263,7 +257,7 @@ class Fit:
 
     def stopped(self) -> bool:
         """Whether the fit is asked to end here, which then is its reason."""
-        asked = self._stop is not None and bool(self.ranks.sum(torch.tensor(int(self._stop()))))
+        asked = self._stop is not None and bool(self.problem.total(torch.tensor(int(self._stop()))))
         if asked:
             self.note_end(Reason.INTERRUPTED)
         return asked
@@ -323,9 +317,7 @@ class Fit:
                 f"the fit that is to go on has had {state.iteration} iterations, more than the "
                 f"{self.trainer.limit} asked for; ask for more."
             )
-        if self.ranks.world > 1:  # what was kept is the first process's part
-            point = self.problem.evaluate(state.theta)
-            state = replace(state, residual=point.residual, seen=point.seen)
+        state = self.problem.of_own_records(state)  # what was kept is the first process's part
         self.at = replace(at, search=self.trainer.prolonged(state))
         self.reason = self.state.reason
         self._write_best()
@@ -386,7 +378,7 @@ class Fit:
             near = Point(theta, theta, 0.0, at.judged) if at.judged else None
             point = self.judge.evaluate(theta, near)  # every output counts alike
             # Each process has all of these records, and its own rounding errors.
-            score = float(self.ranks.first(torch.tensor(point.cost, dtype=torch.float64)))
+            score = float(self.problem.agreed(torch.tensor(point.cost, dtype=torch.float64)))
             validation_rmse, judged = self.judge.rmse_at(point), point.seen
         better = score < (at.kept.score if at.history else math.inf)  # False for NaN
         seconds += (at.history[-1].seconds if at.history else 0.0) + time.perf_counter() - clock

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch.distributed import Ranks
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.least_squares.box import Box, bounds_of
 from lfrtorch.least_squares.linear_systems import System
@@ -32,7 +31,7 @@ class Guarantee(Protocol):
         ...
 
 
-def guarantee_of(name: Name | None, cell: LFRCell, samples: int, ranks: Ranks) -> Guarantee | None:
+def guarantee_of(name: Name | None, cell: LFRCell, samples: int) -> Guarantee | None:
     """The guarantee of a name; None if there is none, or nothing that could break it."""
     if name == "contracting" or isinstance(name, float):
         contracting = import_module("lfrtorch.guarantees.contracting").Contracting
@@ -41,4 +40,4 @@ def guarantee_of(name: Name | None, cell: LFRCell, samples: int, ranks: Ranks) -
     if name is None and torch.isfinite(bounds).any():
         return Box(bounds)
     moves = cell.A.requires_grad and not cell.held.get("A", cell.A.new_zeros(1)).all()
-    return Stable(cell, samples, ranks) if name == "stable" and moves else None
+    return Stable(cell, samples) if name == "stable" and moves else None

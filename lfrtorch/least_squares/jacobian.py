@@ -16,11 +16,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch.distributed import Ranks
 from lfrtorch.least_squares.gauge import Reduction
 from lfrtorch.least_squares.held_steps import ProjectedSystem, Projection
 from lfrtorch.least_squares.linear_systems import (
-    BroadcastSystem,
     CholeskySystem,
     GramAccumulator,
     QRAccumulator,
@@ -51,12 +49,11 @@ class Jacobian:
         parts: Sequence[TermRows | PenaltyRows],
         reduced: Reduction,
         project: Projection,
-        ranks: Ranks,
         shared: int,
         rank: int,
         bounded: Callable[[System], System] | None = None,
     ) -> None:
-        self.parts, self._reduced, self._project, self.ranks = parts, reduced, project, ranks
+        self.parts, self._reduced, self._project = parts, reduced, project
         self._shared, self._rank, self._bounded = shared, rank, bounded
 
     def system(self, damping: float, truncation: float) -> tuple[System, Float[Tensor, " P"]]:
@@ -71,7 +68,7 @@ class Jacobian:
             if not isinstance(part, PenaltyRows):
                 room -= part.fold(self._reduced.kept, total, room)
                 states += [] if part.states is None else [part.states]
-        total.combine(self.ranks)
+        self._complete(total)
         penalty = None
         if penalties:
             squares = torch.stack([part.diagonal.square() for part in penalties])
@@ -88,9 +85,10 @@ class Jacobian:
         if self._bounded is not None:
             held = ProjectedSystem(system, self._project) if self._project.held else system
             system = self._bounded(held)
-        if self.ranks.world == 1:
-            return system, gradient
-        return BroadcastSystem(system, self.ranks), self.ranks.first(gradient)
+        return system, gradient
+
+    def _complete(self, total: QRAccumulator | GramAccumulator) -> None:
+        """Add the rows that others have; there are none."""
 
     def _normal(
         self, G: Float[Tensor, "columns columns"], penalty: Float[Tensor, " P"] | None
@@ -159,7 +157,7 @@ class Jacobian:
         for part, own in zip(self.parts, each, strict=True):
             part.adjoint(own, gradient, reduced)
         gradient[: self._shared] += self._reduced.gradient(reduced)
-        return self.ranks.sum(self._project(gradient))
+        return self._project(gradient)
 
     def whole(self) -> Float[Tensor, "M P"]:
         """J as one matrix, for small problems."""

@@ -22,7 +22,6 @@ from torch import Tensor
 
 from lfrtorch._support.threads import spread, to_float64
 from lfrtorch._support.types import Array
-from lfrtorch.distributed import Ranks
 
 MERGED = 16
 """Triangles are merged into one when they have this many times the rows of one."""
@@ -163,27 +162,6 @@ def largest_eigenvalue(G: Float[Tensor, "P P"]) -> float:
         return float(torch.linalg.eigvalsh(G)[-1])
 
 
-class BroadcastSystem:
-    """A system that the first process solves for all: each has its own rounding errors."""
-
-    def __init__(self, system: System, ranks: Ranks) -> None:
-        self._system, self._ranks = system, ranks
-        self.size = self._shared(system.size)
-        self.rank = int(ranks.first(torch.tensor(system.rank)))
-
-    @property
-    def scale(self) -> float:
-        """Largest eigenvalue of JᵀJ."""
-        return self._shared(self._system.scale)
-
-    def _shared(self, number: float) -> float:
-        return float(self._ranks.first(torch.tensor(number, dtype=torch.float64)))
-
-    def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
-        """-(JᵀJ + λI)⁻¹ gradient."""
-        return self._ranks.first(self._system.solve(gradient, damping))
-
-
 class QRAccumulator:
     """The triangular R with RᵀR = AᵀA for the rows of A so far, by orthogonal transformations."""
 
@@ -213,9 +191,9 @@ class QRAccumulator:
         """Add some columns of the rows of another."""
         self.fold(other.R[:, kept])
 
-    def combine(self, ranks: Ranks) -> None:
-        """Add the rows of all other processes."""
-        self._parts = [torch.linalg.qr(ranks.stack(self.R), mode="r").R]
+    def replace(self, R: Float[Tensor, "k n"]) -> None:
+        """Take another matrix in place of its own."""
+        self._parts = [R]
 
     @property
     def R(self) -> Float[Tensor, "k n"]:
@@ -260,9 +238,9 @@ class GramAccumulator:
         """Add some columns of the rows of another."""
         self.add(other.G[kept.unsqueeze(1), kept])
 
-    def combine(self, ranks: Ranks) -> None:
-        """Add the rows of all other processes."""
-        self._parts = [ranks.sum(self.G)]
+    def replace(self, G: Float[Tensor, "n n"]) -> None:
+        """Take another matrix in place of its own."""
+        self._parts = [G]
 
     @property
     def G(self) -> Float[Tensor, "n n"]:

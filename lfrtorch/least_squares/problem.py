@@ -7,14 +7,13 @@ import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import cached_property, partial
-from typing import Self
+from typing import Any, Self, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._support.errors import InputError
-from lfrtorch.distributed import Ranks
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
@@ -22,11 +21,14 @@ from lfrtorch.least_squares.guarantee import Guarantee, Name, guarantee_of
 from lfrtorch.least_squares.held_steps import HeldSteps
 from lfrtorch.least_squares.jacobian import Jacobian
 from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, Point
+from lfrtorch.least_squares.record_groups import EVERY
 from lfrtorch.least_squares.ridge import Ridge, RidgePenalty, ridge_by_entry
 from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.least_squares.term import Term
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, of_one_unit
+
+State = TypeVar("State")
 
 BATCH = 32
 """Records in a minibatch, about."""
@@ -50,9 +52,9 @@ class Problem(LeastSquares):
         ridge: Ridge = 0.0,
         guarantee: Guarantee | None = None,
     ) -> None:
-        self.lfr, self.errors, self.ranks = lfr, errors, errors.ranks
+        self.lfr, self.errors = lfr, errors
         self._terms: list[Term] = [errors, *others]
-        self.theta = errors.first_theta()
+        self.theta = self._first_theta()
         """θ_0."""
         self.weigh(ridge)
         self._guarantee = guarantee
@@ -69,21 +71,42 @@ class Problem(LeastSquares):
         ridge: Ridge = 0.0,
         guarantee: Name | None = None,
         longest: int | None = None,
-        ranks: Ranks | None = None,
     ) -> Self:
         """The simulation errors of a model over records of its channels and rate."""
         # ``longest``: samples of the longest record before they were cut into windows, which
-        # ``"stable"`` goes by. Processes share the records: all have the same θ, cost and gradient,
-        # each the residual of its own records.
-        errors = _errors_of(model, records, Ranks() if ranks is None else ranks)
+        # ``"stable"`` goes by.
+        errors = errors_of(model, records)
         longest = longest or max(record.samples for record in as_records(records))
-        kept = guarantee_of(guarantee, model.lfr.cell, longest, errors.ranks)
+        kept = guarantee_of(guarantee, model.lfr.cell, longest)
         return cls(model.lfr, errors, ridge=ridge, guarantee=kept)
 
     @classmethod
     def judge(cls, model: Model, records: Record | Sequence[Record]) -> Self:
         """The errors on records that are not fitted, each from its most probable initial state."""
-        return cls(model.lfr, _errors_of(model, records, Ranks(), solve_initial_states=True))
+        return cls(model.lfr, errors_of(model, records, solve_initial_states=True))
+
+    # What follows is shared by several processes (``shared_problem``), or by one alone.
+
+    shared = False
+    """Whether other processes have some of the records."""
+
+    def total(self, part: Tensor) -> Tensor:
+        """The sum of the parts of all processes."""
+        return part
+
+    def agreed(self, part: Tensor) -> Tensor:
+        """The numbers of the first process, whose rounding errors all go by."""
+        return part
+
+    def of_own_records(self, state: State) -> State:
+        """A search's state with the residual of the records that this process has."""
+        return state
+
+    def _first_theta(self) -> Float[Tensor, " P"]:
+        return self.errors.first_theta()
+
+    def _jacobian(self, *parts: Any) -> Jacobian:
+        return Jacobian(*parts)
 
     @property
     def size(self) -> int:
@@ -103,7 +126,7 @@ class Problem(LeastSquares):
         """Give the ridge another weight; it still pulls to where the search began."""
         weight = ridge_by_entry(ridge, self.errors.parameters.sizes)
         self._terms = [term for term in self._terms if not isinstance(term, RidgePenalty)]
-        if weight.any() and self.ranks.rank == 0:
+        if weight.any():
             self._terms.append(RidgePenalty(weight, self.theta))
 
     def rmse(self, theta: Float[Tensor, " P"]) -> float:
@@ -115,12 +138,11 @@ class Problem(LeastSquares):
 
     def rmse_at(self, point: Point) -> float:
         """RMSE at a point."""
-        return self.errors.rmse(point.seen[0])
+        return math.sqrt(self.total(self.errors.squares(point.seen[0])) / self.size)
 
     def cost(self, residual: Float[Tensor, " M"]) -> float:
-        """|r|² of all processes."""
-        own = residual @ residual
-        return float(own if self.ranks.world == 1 else self.ranks.sum(own))
+        """|r|²."""
+        return float(self.total(residual @ residual))
 
     def evaluate(self, theta: Float[Tensor, " P"], near: Point | None = None) -> Point:
         """r at θ, infinite or NaN if the model diverges, and the trajectories.
@@ -142,7 +164,7 @@ class Problem(LeastSquares):
         found = self._held.admissible(theta)
         if self._guarantee is None:
             return found
-        return self.ranks.first(self._guarantee.admissible(found))
+        return self.agreed(self._guarantee.admissible(found))
 
     def linearise(self, theta: Float[Tensor, " P"], *, eliminate: bool = True) -> Jacobian:
         """dr/dθ at θ."""
@@ -156,7 +178,7 @@ class Problem(LeastSquares):
         # needs them all.
         theta, own = point.theta, self.errors.parameters.own
         states = len(theta) - own
-        eliminate = eliminate and states > own and self.ranks.world == 1
+        eliminate = eliminate and states > own and not self.shared
         if eliminate not in self._checked:  # the same at every θ
             spectral = sum(group.y.numel() for group in self.errors.groups if group.spectral)
             check_fit_memory(self.lfr.cell, 0 if eliminate else states, spectral)
@@ -173,7 +195,7 @@ class Problem(LeastSquares):
         bounded = None if self._guarantee is None else partial(self._guarantee.bounded, theta)
         rank = len(reduced.kept) if reduced.expand is not None else self.rank
         project = self._held.projection(theta)
-        return Jacobian(rows, reduced, project, self.ranks, shared, rank, bounded)
+        return self._jacobian(rows, reduced, project, shared, rank, bounded)
 
     @cached_property
     def _worth_reducing(self) -> bool:
@@ -190,9 +212,9 @@ class Problem(LeastSquares):
         return len(self._reduction(self.theta).kept)
 
     def _reduction(self, theta: Float[Tensor, " P"]) -> Reduction:
-        """The columns that gauge directions leave, the same ones on all processes."""
+        """The columns that gauge directions leave."""
         held = any(group.x0 is not None for group in self.errors.groups)
-        held = bool(self.ranks.sum(theta.new_tensor(float(held))))
+        held = bool(self.total(theta.new_tensor(float(held))))
         found = reduction(
             self.errors.parameters.weights(theta),
             self.errors.parameters.initial_states(theta),
@@ -200,10 +222,10 @@ class Problem(LeastSquares):
             before=self._reduced,
             fixed=self._held.entries,
         )
-        # Rounding errors decide between columns that are as good; processes must agree.
+        # Rounding errors decide between columns that are as good.
         kept, expand = found
-        expand = expand if expand is None else self.ranks.first(expand)
-        self._reduced = Reduction(self.ranks.first(kept), expand)
+        expand = expand if expand is None else self.agreed(expand)
+        self._reduced = Reduction(self.agreed(kept), expand)
         return self._reduced
 
     def jacobian(self, theta: Float[Tensor, " P"]) -> Float[Tensor, "M P"]:
@@ -231,7 +253,7 @@ class Problem(LeastSquares):
         counts = [len(group.u) for group in self.errors.groups]
         parts = math.ceil(sum(counts) / BATCH)
         ridges = [term for term in self._terms if isinstance(term, RidgePenalty)]
-        if sum(counts) < 2 * BATCH or self.ranks.world > 1 or len(self._terms) > 1 + len(ridges):
+        if sum(counts) < 2 * BATCH or self.shared or len(self._terms) > 1 + len(ridges):
             return [self]
         generator = torch.Generator().manual_seed(epoch)
         order = torch.randperm(sum(counts), generator=generator)  # of all, and dealt out
@@ -270,22 +292,17 @@ class Problem(LeastSquares):
             self._reduced = Reduction(tensors["kept"], None)
 
 
-def _errors_of(
+def errors_of(
     model: Model,
     records: Record | Sequence[Record],
-    ranks: Ranks,
     *,
+    own: slice = EVERY,
     solve_initial_states: bool = False,
 ) -> SimulationErrors:
     """The errors of a model over records in physical units."""
     data = as_records(records)
     for record in data:
         model.check(record)
-    if len(data) < ranks.world:
-        raise InputError(
-            f"{ranks.world} processes share {len(data)} record(s); each needs one: start "
-            "fewer processes, or cut the data into more records."
-        )
     if any(record.start == "measured" for record in data):
         _check_measured(model)
     estimated = any(record.start == "estimated" for record in data)
@@ -295,7 +312,7 @@ def _errors_of(
     return SimulationErrors(
         model.lfr.cell,
         [model.scaler.normalise(record) for record in data],
-        ranks,
+        own=own,
         y_scale=model.scaler.y_scale if of_one_unit(model.outputs) else 1.0,
         solve_initial_states=solve_initial_states,
     )

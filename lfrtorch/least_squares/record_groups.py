@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lfrtorch._support.types import Array
-from lfrtorch.distributed import Ranks
 from lfrtorch.engine.initial_state import measured_start
 from lfrtorch.engine.weights import Weights
 from lfrtorch.records import NormalisedRecord, Record, Start
@@ -93,14 +92,14 @@ class RecordGroup:
 
 
 def group_records(
-    records: Sequence[NormalisedRecord], model: Weights, ranks: Ranks
+    records: Sequence[NormalisedRecord], model: Weights, own: slice = EVERY
 ) -> list[RecordGroup]:
-    """A process's share of the records, grouped, as tensors like the numbers of the model."""
+    """Records, or some of them, grouped, as tensors like the numbers of the model."""
     members: dict[tuple[int, Start, bool], list[NormalisedRecord]] = defaultdict(list)
     estimated: dict[tuple[int, Start, bool], list[int]] = defaultdict(list)
     count = itertools.count()
     numbers = [next(count) if each.record.start == "estimated" else 0 for each in records]
-    for each, number in ranks.share(list(zip(records, numbers, strict=True))):
+    for each, number in list(zip(records, numbers, strict=True))[own]:
         kind = each.record.samples, each.record.start, each.record.line_weight is not None
         members[kind].append(each)
         estimated[kind].append(number)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from copy import copy
 
@@ -12,14 +11,13 @@ from torch import Tensor
 
 from lfrtorch._support.threads import has_kernels
 from lfrtorch._support.types import Array
-from lfrtorch.distributed import Ranks
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.initial_state import estimated_start, start_from_beginning
 from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulation import Trajectory, simulate, steady_state
 from lfrtorch.engine.weights import Weights
 from lfrtorch.least_squares.output_rows import Memory, OutputRows
-from lfrtorch.least_squares.record_groups import group_records
+from lfrtorch.least_squares.record_groups import EVERY, group_records
 from lfrtorch.least_squares.term import Seen
 from lfrtorch.records import NormalisedRecord
 
@@ -76,6 +74,7 @@ class Parameters:
 class SimulationErrors:
     """A term of a problem: weighted y_hat - y, normalised; 0 where a sample does not count."""
 
+    # ``own``: which of the records have errors; start states in θ are those of all.
     # ``solve_initial_states``: estimated initial states are no part of θ, but solved for at every
     # θ, and outputs end at the limits of a record, as in a score.
 
@@ -83,18 +82,18 @@ class SimulationErrors:
         self,
         cell: LFRCell,
         records: Sequence[NormalisedRecord],
-        ranks: Ranks,
         *,
+        own: slice = EVERY,
         y_scale: Array | float = 1.0,
         solve_initial_states: bool = False,
     ) -> None:
         cell.check()
-        self.ranks, self._y_scale = ranks, y_scale
+        self._y_scale = y_scale
         self._solved = solve_initial_states
         estimated = sum(each.record.start == "estimated" for each in records)
         self.parameters = Parameters(cell, 0 if solve_initial_states else estimated)
         start = self.parameters.weights(self.parameters.start)
-        self.groups = group_records(records, start, ranks)
+        self.groups = group_records(records, start, own)
         self.size = sum(int(each.record.scored.sum()) for each in records)
         self._memory = Memory()
 
@@ -121,14 +120,14 @@ class SimulationErrors:
             rows.append(OutputRows(counted, linearisation, x0, self._memory, eliminate=eliminate))
         return rows
 
-    def rmse(self, seen: Seen) -> float:
-        """RMSE over scored samples and outputs, unweighted, in output units, as in a score."""
-        total = 0.0
+    def squares(self, seen: Seen) -> Tensor:
+        """Sum of squared errors over scored samples, unweighted, in output units, as in a score."""
+        total = torch.zeros((), dtype=torch.float64)
         for group, trajectory in zip(self.groups, seen, strict=True):
             scale = torch.as_tensor(self._y_scale).to(group.y)
             errors = (group.shown(trajectory.y) - group.y) * scale * group.scored
-            total += errors.double().square().sum()
-        return math.sqrt(self.ranks.sum(torch.as_tensor(total)) / self.size)
+            total = total + errors.double().square().sum()
+        return total
 
     def _simulated(self, theta: Float[Tensor, " P"], near: Seen | None) -> tuple[Trajectory, ...]:
         """The trajectory of each group at θ, from the states near it."""
@@ -167,7 +166,7 @@ class SimulationErrors:
                 if group.beyond is not None:
                     weight = weight * (group.beyond == 0)
                 states[group.estimated] = start_from_beginning(W, group.u, group.y, weight)
-        return torch.cat([start, self.ranks.sum(states).flatten()])
+        return torch.cat([start, states.flatten()])
 
     def release(self) -> None:
         """Free the memory of rows."""

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lfrtorch._support.threads import to_float64
-from lfrtorch.distributed import Ranks
+from lfrtorch.distributed import agreed
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.held import integrating_states
 from lfrtorch.engine.linearised import spectral_radius
@@ -88,12 +88,12 @@ class Stable:
     # If they are not within the unit circle at the start, they stay within the circle that they are
     # in.
 
-    def __init__(self, cell: LFRCell, samples: int, ranks: Ranks) -> None:
+    def __init__(self, cell: LFRCell, samples: int) -> None:
         self._nx, self._integrating = cell.nx, integrating_states(cell)
         held = cell.held.get("A", torch.zeros(cell.A.shape, dtype=torch.bool)).to(cell.A.device)
         self._held = held & ~self._integrating
-        radius = spectral_radius(fading(cell.A, self._integrating)).double()
-        self._limit = max(largest_modulus(samples), float(ranks.first(radius)))
+        radius = agreed(spectral_radius(fading(cell.A, self._integrating)).double())
+        self._limit = max(largest_modulus(samples), float(radius))
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
         """θ with A's eigenvalues within the limit."""

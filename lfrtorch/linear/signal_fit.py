@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 
 from lfrtorch._support.types import Array
-from lfrtorch.distributed import Ranks
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.least_squares.linear_systems import SVDSystem
@@ -244,7 +243,7 @@ class SignalFit:
             parameter.requires_grad_(observed)
         for name, free in (("Bu", free_B), ("Dyu", free_D)):
             cell.hold({name: (torch.as_tensor(~free), cell.get_parameter(name).detach())})
-        errors = SimulationErrors(cell, self._driven, Ranks())
+        errors = SimulationErrors(cell, self._driven)
         measured = slice(nu, nu + ny) if self._prediction and stable else None
         walls = [_PoleWall(errors, measured)] if observed else []
         return Problem(LFR(cell), errors, walls)

@@ -9,6 +9,7 @@ import torch
 
 import lfrtorch
 from lfrtorch import Choice, LinearModel, Model, Record
+from lfrtorch.distributed import using
 from lfrtorch.fitting import choice as procedure
 from lfrtorch.fitting.trainer import StoppedError
 
@@ -218,5 +219,6 @@ def test_all_processes_take_the_choice_of_the_first(saturating: Choice):
             squares[-1] = 1.0
             return squares
 
-    best = procedure._chosen(saturating.candidates, [0, 1], saturating.counts, Other())
+    with using(Other()):
+        best = procedure._chosen(saturating.candidates, [0, 1], saturating.counts)
     assert best is saturating.candidates[-1]

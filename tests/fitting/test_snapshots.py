@@ -16,7 +16,7 @@ from torch.nn.utils import parameters_to_vector
 
 from lfrtorch._support.atomic import TEMPORARY
 from lfrtorch._support.reasons import Reason
-from lfrtorch.distributed import Ranks
+from lfrtorch.distributed import Ranks, using
 from lfrtorch.fitting import state_file, trainer
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.snapshots import Snapshots
@@ -288,22 +288,6 @@ def test_the_best_score_of_all(tmp_path: Path):
     assert Snapshots(tmp_path).least == min(p.score for p in result.history)
 
 
-def test_processes_take_their_own_residuals(tmp_path: Path):
-    """The residual on disk is the first one's alone."""
-
-    class Two(Ranks):
-        world = 2
-
-    data, optimiser = records()[0], LevenbergMarquardt(max_iter=3)
-    ranks = Ranks()
-    fit = Fit(starts(1)[0], data, trainer=optimiser, ranks=ranks).advance(until=2)
-    fit.save(tmp_path / "fit")
-    again = Fit(starts(1)[0], data, trainer=optimiser, ranks=ranks)
-    again.ranks = Two()
-    again.restore(tmp_path / "fit")
-    assert torch.equal(again.state.residual, again.problem.residual(again.state.theta))
-
-
 def test_processes_forget_the_periodic_orbits_of_the_first(tmp_path: Path):
     """The guesses on disk are those of the first process's records."""
 
@@ -314,7 +298,8 @@ def test_processes_forget_the_periodic_orbits_of_the_first(tmp_path: Path):
     data = [measure(model, 50, seed=i, start="periodic") for i in range(3)]  # two are the first's
     fit = Fit(starts(1)[0], data[::2], trainer=LevenbergMarquardt(max_iter=3))
     fit.advance(until=2).save(tmp_path / "fit")
-    again = Fit(starts(1)[0], data, trainer=LevenbergMarquardt(max_iter=3), ranks=Second())
+    with using(Second()):
+        again = Fit(starts(1)[0], data, trainer=LevenbergMarquardt(max_iter=3))
     again.restore(tmp_path / "fit")
     alone = Fit(again.model, data[1::2]).problem
     # Of one point to the tolerance of the steady state, 1e-10, times the gain.

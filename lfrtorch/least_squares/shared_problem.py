@@ -1,0 +1,140 @@
+"""A problem whose records several processes share, each the residual of its own.
+
+All of them have the same θ, cost, gradient and steps: sums go over all processes, and what rounding
+errors decide is the first one's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lfrtorch._support.errors import InputError
+from lfrtorch.distributed import Ranks, current
+from lfrtorch.least_squares.guarantee import Name, guarantee_of
+from lfrtorch.least_squares.jacobian import Jacobian
+from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator, System
+from lfrtorch.least_squares.problem import Problem, errors_of
+from lfrtorch.least_squares.ridge import Ridge
+from lfrtorch.model import Model
+from lfrtorch.records import Record, as_records
+
+
+def problem_of(model: Model, records: Record | Sequence[Record], **options: Any) -> Problem:
+    """The problem of the processes that work together now, see ``Problem.of``."""
+    kind = SharedProblem if current().world > 1 else Problem
+    return kind.of(model, records, **options)
+
+
+class SharedProblem(Problem):
+    """One process's part of a problem."""
+
+    shared = True
+    _ranks: Ranks
+
+    @classmethod
+    def of(
+        cls,
+        model: Model,
+        records: Record | Sequence[Record],
+        *,
+        ridge: Ridge = 0.0,
+        guarantee: Name | None = None,
+        longest: int | None = None,
+    ) -> Self:
+        """The simulation errors of the first process's model over the records of all."""
+        ranks, data = current(), as_records(records)
+        if len(data) < ranks.world:
+            raise InputError(
+                f"{ranks.world} processes share {len(data)} record(s); each needs one: start "
+                "fewer processes, or cut the data into more records."
+            )
+        same_weights([model])
+        found = cls.__new__(cls)
+        found._ranks = ranks
+        errors = errors_of(model, data, own=slice(ranks.rank, None, ranks.world))
+        longest = longest or max(record.samples for record in data)
+        kept = guarantee_of(guarantee, model.lfr.cell, longest)
+        found.__init__(model.lfr, errors, ridge=ridge, guarantee=kept)
+        return found
+
+    def total(self, part: Tensor) -> Tensor:
+        """The sum of the parts of all processes."""
+        return self._ranks.sum(part)
+
+    def agreed(self, part: Tensor) -> Tensor:
+        """The numbers of the first process."""
+        return self._ranks.first(part)
+
+    def of_own_records(self, state: Any) -> Any:
+        """A search's state with the residual of the records that this process has."""
+        point = self.evaluate(state.theta)
+        return replace(state, residual=point.residual, seen=point.seen)
+
+    def weigh(self, ridge: Ridge) -> None:
+        """Give the ridge another weight; the first process has its rows."""
+        super().weigh(ridge if self._ranks.rank == 0 else 0.0)
+
+    def _first_theta(self) -> Float[Tensor, " P"]:
+        theta, own = self.errors.first_theta(), self.errors.parameters.own
+        return torch.cat([theta[:own], self.total(theta[own:])])
+
+    def _jacobian(self, *parts: Any) -> Jacobian:
+        return _SharedJacobian(*parts, ranks=self._ranks)
+
+
+class _SharedJacobian(Jacobian):
+    """The rows of all processes, of which each has some."""
+
+    def __init__(self, *parts: Any, ranks: Ranks) -> None:
+        super().__init__(*parts)
+        self._ranks = ranks
+
+    def system(self, damping: float, truncation: float) -> tuple[System, Float[Tensor, " P"]]:
+        """The least-squares system of J and its gradient, as the first process has them."""
+        system, gradient = super().system(damping, truncation)
+        return BroadcastSystem(system, self._ranks), self._ranks.first(gradient)
+
+    def adjoint(self, residual: Float[Tensor, " M"]) -> Float[Tensor, " P"]:
+        """Jᵀ residual."""
+        return self._ranks.sum(super().adjoint(residual))
+
+    def _complete(self, total: QRAccumulator | GramAccumulator) -> None:
+        if isinstance(total, GramAccumulator):
+            total.replace(self._ranks.sum(total.G))
+        else:
+            total.replace(torch.linalg.qr(self._ranks.stack(total.R), mode="r").R)
+
+
+class BroadcastSystem:
+    """A system that the first process solves for all: each has its own rounding errors."""
+
+    def __init__(self, system: System, ranks: Ranks) -> None:
+        self._system, self._ranks = system, ranks
+        self.size = self._shared(system.size)
+        self.rank = int(ranks.first(torch.tensor(system.rank)))
+
+    @property
+    def scale(self) -> float:
+        """Largest eigenvalue of JᵀJ."""
+        return self._shared(self._system.scale)
+
+    def _shared(self, number: float) -> float:
+        return float(self._ranks.first(torch.tensor(number, dtype=torch.float64)))
+
+    def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
+        """-(JᵀJ + λI)⁻¹ gradient."""
+        return self._ranks.first(self._system.solve(gradient, damping))
+
+
+@torch.no_grad()
+def same_weights(models: Sequence[Model]) -> None:
+    """Give all processes that work together the weights of the first one's models."""
+    for model in models if current().world > 1 else ():
+        for p in model.lfr.parameters():
+            p.copy_(current().first(p.detach()))
