@@ -90,13 +90,24 @@ _CURRENT = [Ranks()]
 
 
 def current() -> Ranks:
-    """The processes that work together now: those of the last ``connect``, or this one alone."""
+    """The processes that work together now: those of the last ``connect``, or this one alone.
+
+    Example:
+        >>> lfrtorch.distributed.current().world
+        1
+    """
     return _CURRENT[-1]
 
 
 @contextmanager
 def using(ranks: Ranks | None) -> Iterator[Ranks]:
-    """Let other processes work together meanwhile; with None it stays as it is."""
+    """Let other processes work together meanwhile; with None it stays as it is.
+
+    Example:
+        >>> with lfrtorch.distributed.using(lfrtorch.distributed.Ranks()) as alone:
+        ...     alone is lfrtorch.distributed.current()
+        True
+    """
     _CURRENT.append(current() if ranks is None else ranks)
     try:
         yield current()
@@ -105,7 +116,12 @@ def using(ranks: Ranks | None) -> Iterator[Ranks]:
 
 
 def agreed(part: Tensor) -> Tensor:
-    """The numbers of the first process, on each of those that work together."""
+    """The numbers of the first process, on each of those that work together.
+
+    Example:
+        >>> lfrtorch.distributed.agreed(torch.ones(2))
+        tensor([1., 1.])
+    """
     return current().first(part)
 
 

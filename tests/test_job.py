@@ -26,11 +26,11 @@ from lfrtorch import (
 )
 from lfrtorch.cli import config, fit
 from lfrtorch.fitting.first_fit import part_of
+from lfrtorch.fitting.linear_start import linear_records
 from lfrtorch.fitting.multistart import cheap_starts
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import StoppedError
-from lfrtorch.job import linear_records
 from lfrtorch.reporting import Console, plots, write
 
 SHORT = LevenbergMarquardt(max_iter=4)
@@ -127,7 +127,7 @@ def test_a_model_that_does_not_forget_where_it_began_is_not_called_better(
     dataset: Dataset, monkeypatch
 ):
     memory = lfrtorch.Memory(1.5)
-    monkeypatch.setattr("lfrtorch.job.forgets", lambda *_: memory)
+    monkeypatch.setattr("lfrtorch.reporting.scored_run.forgets", lambda *_: memory)
     run = identify(dataset, settings(trainer=LevenbergMarquardt(max_iter=20)))
     assert (run.verdict.kind, run.verdict.use) == ("linear", "linear model")
     assert "but it does not forget where it began" in run.verdict.text
@@ -209,7 +209,7 @@ def test_a_map_of_ones_own_is_made_with_its_sizes_and_a_slow_one_is_told(
     run = identify(dataset, settings(static=Cubic), observer=Console())
     assert isinstance(run.model.lfr.cell.static, Cubic)
     assert "not compiled" not in capsys.readouterr().out
-    monkeypatch.setattr("lfrtorch.job.SLOW_SAMPLES", 300)
+    monkeypatch.setattr("lfrtorch.fitting.whole_fit.SLOW_SAMPLES", 300)
     for static in ("polynomial", Cubic):
         identify(dataset, settings(static=static, degree=2), observer=Console())
         assert ("not compiled" in capsys.readouterr().out) == (static is Cubic)

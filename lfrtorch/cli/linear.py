@@ -22,7 +22,7 @@ from lfrtorch.cli.composition import started
 from lfrtorch.cli.config import configured, limit_threads, loaded
 from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.cli.run_folder import CONFIG, arguments, no_empty_folder, program
-from lfrtorch.job import linear_model, linear_records
+from lfrtorch.fitting.linear_start import linear_model, linear_records
 from lfrtorch.linear.requirements import of_response
 from lfrtorch.reporting import linear_report
 from lfrtorch.reporting.console import Console

@@ -1,67 +1,70 @@
-"""The first iterations of a fit, on a part of the training samples, where they cost less."""
+"""A first fit to a part of the records, which chooses one of the starts for a part of the cost."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch._support.tables import quantity
 from lfrtorch.distributed import current
-from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.settings import Settings
-from lfrtorch.fitting.stage import Stage
-from lfrtorch.fitting.trainer import StoppedError
-from lfrtorch.model import Model
+from lfrtorch.fitting.stage import Data, Job, Stage, best_start
+from lfrtorch.fitting.trainer import FitResult, Trainer
 from lfrtorch.records import Record, common_unit
 
 
-def begun_on_part(stage: Stage, models: list[Model]) -> tuple[Settings, list[Model]]:
-    """The best start, or those of a mean, after iterations on a part of the records."""
-    dataset, settings, observer = stage.dataset, stage.settings, stage.observer
-    if settings.first_part == 1.0:
-        return settings, models
-    train = dataset.train
-    part = first_records(stage)
-    samples, all_samples = (sum(r.samples for r in records) for records in (part, train))
-    if max(len(models), len(part)) < current().world or samples == all_samples:
-        observer.say(
-            f"note: first_part is {settings.first_part}, and there are {len(train)} training "
-            "record(s): all are fitted from the first iteration"
+class FirstPart(Stage):
+    """The first iterations, on a part of the training samples."""
+
+    name = "the first iterations, on a part of the records"
+
+    def when(self, job: Job) -> bool:
+        """Whether there is a part to be fitted."""
+        if job.settings.first_part == 1.0:
+            return False
+        part, train = self.data(job).train, job.dataset.train
+        if max(len(job.models), len(part)) < current().world or _samples(part) == _samples(train):
+            job.observer.say(
+                f"note: first_part is {job.settings.first_part}, and there are {len(train)} "
+                "training record(s): all are fitted from the first iteration"
+            )
+            return False
+        return True
+
+    def data(self, job: Job) -> Data:
+        """The part."""
+        train = part_of(job.dataset.train, job.settings.first_part)
+        return Data.of(job.dataset)._replace(train=train)
+
+    def trainer(self, job: Job) -> Trainer:
+        """The job's, for these iterations."""
+        base: Any = job.settings.trainer
+        return replace(base, max_iter=job.settings.first_iterations)
+
+    def options(self, job: Job) -> Mapping[str, Any]:
+        """Starts of a mean go on."""
+        return {"average": job.settings.average}
+
+    def keep(self, job: Job, result: FitResult) -> Job:
+        """The best start, or those of a mean."""
+        settings, models = best_start(job, result)
+        if result.members:
+            models = list(result.members)
+            settings = replace(job.settings, starts=len(models))
+        chosen = result.history[result.chosen_iteration]
+        part = _samples(self.data(job).train)
+        job.observer.say(
+            f"first {result.iterations} iterations on {part} of {_samples(job.dataset.train)} "
+            f"training samples: {quantity(result.seconds, 's')}, error "
+            f"{quantity(chosen.train, common_unit(result.model.outputs))}, seed {settings.seed}"
         )
-        return settings, models
-    trainer: Any = settings.trainer
-    monitor = observer.searching()
-    result = fit(
-        models,
-        part,
-        dataset.validation,
-        dataset.selection,
-        monitors=None if monitor is None else [[monitor]] * len(models),
-        average=settings.average,
-        **{**stage.options, "trainer": replace(trainer, max_iter=settings.first_iterations)},
-    )
-    if result.reason in CUT_SHORT:
-        raise StoppedError("stopped during the first iterations, on a part of the records")
-    best = result.starts[0].number if result.starts else 0
-    seed = settings.seeds[best]
-    chosen = result.history[result.chosen_iteration]
-    unit = common_unit(result.model.outputs)
-    observer.say(
-        f"first {result.iterations} iterations on {samples} of {all_samples} training samples: "
-        f"{quantity(result.seconds, 's')}, error {quantity(chosen.train, unit)}, "
-        f"seed {seed}"
-    )
-    if result.members:
-        return replace(settings, starts=len(result.members)), list(result.members)
-    return replace(settings, seed=seed, starts=1), [result.model]
+        return replace(job, settings=settings, models=models)
 
 
-def first_records(stage: Stage) -> list[Record]:
-    """The training records that the first iterations fit."""
-    return part_of(stage.dataset.train, stage.settings.first_part)
+def _samples(records: Sequence[Record]) -> int:
+    return sum(record.samples for record in records)
 
 
 def cost_in_full(settings: Settings) -> int:

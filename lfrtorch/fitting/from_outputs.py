@@ -8,29 +8,26 @@ shorter ones led.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch._support.tables import quantity
-from lfrtorch.engine.held import measured_states
+from lfrtorch.engine.held import held_parameters, measured_states
 from lfrtorch.fitting.given_entries import transformed
-from lfrtorch.fitting.multistart import fit
-from lfrtorch.fitting.settings import Settings
-from lfrtorch.fitting.stage import Stage
-from lfrtorch.fitting.trainer import StoppedError
-from lfrtorch.fitting.windows import windows, windows_from_outputs
+from lfrtorch.fitting.stage import Data, Job, Stage, best_start
+from lfrtorch.fitting.trainer import FitResult, Trainer
+from lfrtorch.fitting.windows import windows_from_outputs
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
-_PARTS = (0.1, 0.3)
+PARTS = (0.1, 0.3)
 """Of the horizon, that windows have first."""
 
 _ITERATIONS = 10
@@ -46,14 +43,6 @@ def begins_at_outputs(records: Sequence[Record]) -> bool:
             "states are then its outputs."
         )
     return measured == {True}
-
-
-def in_windows(stage: Stage) -> list[Record]:
-    """The training records as the fit simulates them: whole, or in windows from outputs."""
-    train, horizon = stage.dataset.train, stage.settings.horizon
-    if horizon is None or not begins_at_outputs(train):
-        return train
-    return windows(train, horizon, train[0].y.shape[1])
 
 
 def with_measured_states(model: Model) -> Model:
@@ -73,32 +62,64 @@ def with_measured_states(model: Model) -> Model:
     return replace(model, lfr=type(model.lfr)(cell))
 
 
-def begun_on_short_windows(
-    stage: Stage, models: Sequence[Model], **options: Any
-) -> tuple[Settings, list[Model]]:
-    """The best start after fits over short windows, and the settings with its seed."""
-    settings, dataset, observer = stage.settings, stage.dataset, stage.observer
-    found, best = list(models), 0
-    if settings.horizon is None:
-        return settings, found
-    scale = models[0].scaler.y_scale
-    for horizon in sorted({max(2, round(part * settings.horizon)) for part in _PARTS}):
-        monitor = observer.searching()
-        # As many windows as there will be whole ones: these iterations cost so much less.
-        cut = [windows_from_outputs(r, horizon, settings.horizon, scale) for r in dataset.train]
-        short = LevenbergMarquardt(max_iter=_ITERATIONS)
-        result = fit(
-            found,
-            [part for parts in cut for part in parts],
-            monitors=None if monitor is None else [[monitor]] * len(found),
-            **{**stage.options, "trainer": short, "horizon": None, **options},
+class MeasuredStates(Stage):
+    """Starts whose states are the normalised outputs."""
+
+    def when(self, job: Job) -> bool:
+        """Whether the models are made from a linear model of all outputs."""
+        made = job.settings.known is None and job.settings.init_from is None
+        return made and begins_at_outputs(job.dataset.train)
+
+    def run(self, job: Job) -> Job:
+        """The models in these coordinates."""
+        return replace(job, models=[with_measured_states(model) for model in job.models])
+
+
+class ShortWindows(Stage):
+    """A fit over windows of a part of the horizon.
+
+    Args:
+        part: of the horizon.
+    """
+
+    def __init__(self, part: float) -> None:
+        self._part = part
+        self.name = f"the fit over windows of {part:g} of the horizon"
+
+    def when(self, job: Job) -> bool:
+        """Whether the records begin at outputs, and the horizon is longer than these windows."""
+        horizon = job.settings.horizon
+        if job.settings.init_from is not None or horizon is None:
+            return False
+        if held_parameters(job.models[0].lfr.cell).all():
+            return False  # equations without parameters
+        before = [_samples(part, horizon) for part in PARTS if part < self._part]
+        return begins_at_outputs(job.dataset.train) and _samples(self._part, horizon) not in before
+
+    def data(self, job: Job) -> Data:
+        """As many windows as there will be whole ones: these iterations cost so much less."""
+        horizon = cast(int, job.settings.horizon)
+        samples, scale = _samples(self._part, horizon), job.models[0].scaler.y_scale
+        cut = [windows_from_outputs(r, samples, horizon, scale) for r in job.dataset.train]
+        return Data([part for parts in cut for part in parts])
+
+    def trainer(self, job: Job) -> Trainer:
+        """A few iterations."""
+        return LevenbergMarquardt(max_iter=_ITERATIONS)
+
+    def options(self, job: Job) -> Mapping[str, Any]:
+        """The windows are cut."""
+        return {"horizon": None}
+
+    def keep(self, job: Job, result: FitResult) -> Job:
+        """The best start."""
+        settings, models = best_start(job, result) if result.starts else (job.settings, job.models)
+        job.observer.say(
+            f"windows of {_samples(self._part, cast(int, settings.horizon))} samples: "
+            f"{result.iterations} iterations, {quantity(result.seconds, 's')}"
         )
-        if result.reason in CUT_SHORT:
-            raise StoppedError(f"stopped during the fit over windows of {horizon} samples")
-        best = result.starts[0].number if len(found) > 1 else best
-        found = [result.model]
-        observer.say(
-            f"windows of {horizon} samples: {result.iterations} iterations, "
-            f"{quantity(result.seconds, 's')}"
-        )
-    return replace(settings, seed=settings.seeds[best], starts=1), found
+        return replace(job, settings=settings, models=models)
+
+
+def _samples(part: float, horizon: int) -> int:
+    return max(2, round(part * horizon))

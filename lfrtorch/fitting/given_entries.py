@@ -19,9 +19,11 @@ from jaxtyping import Float
 
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import percent
 from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import Matrices
+from lfrtorch.fitting.stage import Job, Stage
 from lfrtorch.model import Model
 
 Given = Mapping[str, Any]
@@ -84,6 +86,29 @@ def with_given(model: Model, given: Given) -> tuple[Model, float]:
             p[torch.as_tensor(mask)] = torch.as_tensor(matrix[mask]).to(p)
     K = None if model.K is None else moved.to(model.K) @ model.K
     return replace(model, lfr=type(model.lfr)(cell), K=K), worst
+
+
+class GivenEntries(Stage):
+    """Starts with the entries of ``fixed``."""
+
+    def check(self, job: Job) -> None:
+        """Refuse matrices of other shapes."""
+        settings, first = job.settings, job.given.train[0]
+        sizes = settings.states, len(first.inputs), len(first.outputs), settings.nz, settings.nw
+        checked(settings.fixed, shapes(*sizes))
+
+    def when(self, job: Job) -> bool:
+        """Whether there are such entries."""
+        return bool(job.settings.fixed)
+
+    def run(self, job: Job) -> Job:
+        """The models with these entries."""
+        found = [with_given(model, job.settings.fixed) for model in job.models]
+        job.observer.say(
+            "fixed: the start differed from what is given by "
+            f"{percent(max(apart for _, apart in found))} of a matrix's largest entry at most"
+        )
+        return replace(job, models=[model for model, _ in found])
 
 
 def shapes(nx: Any, nu: int, ny: int, nz: Any, nw: Any) -> dict[str, tuple[Any, Any]]:

@@ -18,17 +18,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch._support.tables import number, quantity
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.held import no_feedthrough
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.fitting.driven_states import relaxation_frequencies
-from lfrtorch.fitting.from_outputs import begins_at_outputs, begun_on_short_windows, in_windows
-from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.from_outputs import begins_at_outputs
 from lfrtorch.fitting.settings import Settings
-from lfrtorch.fitting.stage import Stage
-from lfrtorch.fitting.trainer import StartDivergesError, StoppedError
+from lfrtorch.fitting.stage import Job, Stage
+from lfrtorch.fitting.trainer import FitResult, StartDivergesError, Trainer
+from lfrtorch.fitting.windows import in_windows
 from lfrtorch.known import Known
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.model import LinearModel
@@ -189,69 +188,105 @@ def varied(model: Model, seed: int) -> Model:
     return found
 
 
-def known_starts(stage: Stage, linear: LinearModel) -> tuple[Settings, list[Model]]:
-    """The settings with the number of starts, and their models.
+class FromEquations(Stage):
+    """A known model with the parameters that are given, and with others near them."""
 
-    The parameters are fitted first, without a ridge: that keeps what is learned afterwards near.
-    """
-    dataset, settings, observer = stage.dataset, stage.settings, stage.observer
-    known = cast(Known, settings.known)
-    from_outputs = begins_at_outputs(dataset.train)
-    if from_outputs:  # which are states: nothing learned acts on them at once
-        known = copy(known)
-        known.acts_on = tuple(name for name in known.acts_on if name != "y")
-        settings = replace(settings, known=known)
-    records = in_windows(stage)
-    model = known_model(known, linear, records)
-    if settings.noise != "output":  # the search begins at the simulation, with no innovations
-        model = replace(model, K=model.lfr.cell.A.new_zeros(model.lfr.cell.nx, len(model.outputs)))
-    if known.outputs is None and len(model.outputs) > 1:
-        pairs = zip(model.outputs, known.observed([y.name for y in model.outputs]), strict=True)
-        observer.say(f"known model: {', '.join(f'{y.name} is {state}' for y, state in pairs)}")
-    grey = settings.nn == 0 and not settings.nx and settings.static == "network"
-    count = _STARTS if settings.starts == "auto" else settings.starts
-    if known.parameters:
-        options: Any = {**stage.options, "ridge": 0.0}
-        options["trainer"] = LevenbergMarquardt(max_iter=_ITERATIONS)
-        monitor = observer.searching()
-        begun = count if grey else _STARTS
-        if from_outputs:  # short windows lead to the best minimum
-            begun, options["trainer"] = 1, LevenbergMarquardt(max_iter=_FROM_OUTPUTS)
-            _, (model,) = begun_on_short_windows(
-                replace(stage, settings=replace(settings, starts=1)), [model], ridge=0.0
-            )
+    def when(self, job: Job) -> bool:
+        """Whether one is given."""
+        return job.settings.known is not None
+
+    def run(self, job: Job) -> Job:
+        """Make the models; without a ridge, which keeps what is learned afterwards near."""
+        settings, train = job.settings, job.dataset.train
+        known, count = cast(Known, settings.known), _count(settings)
+        if begins_at_outputs(train):  # which are states: nothing learned acts on them at once
+            known, count = copy(known), 1  # short windows lead to the best minimum
+            known.acts_on = tuple(name for name in known.acts_on if name != "y")
+            settings = replace(settings, known=known)
+        model = known_model(known, job.linear, in_windows(train, settings.horizon))
+        if settings.noise != "output":  # the search begins at the simulation
+            cell = model.lfr.cell
+            model = replace(model, K=cell.A.new_zeros(cell.nx, cell.ny))
+        if known.outputs is None and len(model.outputs) > 1:
+            observed = known.observed([y.name for y in model.outputs])
+            pairs = zip(model.outputs, observed, strict=True)
+            job.observer.say(f"known model: {', '.join(f'{y.name} is {x}' for y, x in pairs)}")
+        others = [varied(model, settings.seed + n) for n in range(1, count)]
+        return replace(job, settings=settings, models=[model, *others], ridge=0.0)
+
+
+class Parameters(Stage):
+    """The fit to the parameters of a known model alone."""
+
+    name = "the fit to the parameters of the known model"
+
+    def when(self, job: Job) -> bool:
+        """Whether it has any."""
+        return job.settings.known is not None and bool(job.settings.known.parameters)
+
+    def trainer(self, job: Job) -> Trainer:
+        """Enough iterations for few parameters."""
+        begun = begins_at_outputs(job.dataset.train)
+        return LevenbergMarquardt(max_iter=_FROM_OUTPUTS if begun else _ITERATIONS)
+
+    def run(self, job: Job) -> Job:
+        """The job after the fit."""
         try:
-            result = fit(
-                [model, *(varied(model, settings.seed + n) for n in range(1, begun))],
-                dataset.train,
-                dataset.validation,
-                dataset.selection,
-                monitors=None if monitor is None else [[monitor]] * begun,
-                **options,
-            )
+            return super().run(job)
         except StartDivergesError:
             raise StartDivergesError(
                 "the known model diverges on the training records, with the parameters that are "
                 "given and with others near them.\nGive values with which it is stable, start "
                 "states near (State(rest=...)), or more steps in a sample (substeps=10)."
             ) from None
-        if result.reason in CUT_SHORT:
-            raise StoppedError("stopped during the fit to the parameters of the known model")
-        model = result.model
-        error = result.history[result.chosen_iteration].train
+
+    def keep(self, job: Job, result: FitResult) -> Job:
+        """The best values."""
+        model, error = result.model, result.history[result.chosen_iteration].train
         values = ", ".join(f"{name} {number(value)}" for name, value in physical(model).items())
-        observer.say(
+        job.observer.say(
             f"known model: {values}; error {quantity(error, common_unit(model.outputs))} in "
             f"training, {quantity(result.seconds, 's')}"
         )
-    if grey:
-        settings, models = replace(settings, starts=1, ridge=0.0), [model]
-    else:
-        settings = replace(settings, starts=count)
-        models = [with_learned(model, records, settings, n) for n in settings.seeds]
-    for model in models:
-        model.lfr.to(device=settings.device, dtype=settings.dtype)
-    return settings, models
+        return replace(job, models=[model])
+
+
+class Learned(Stage):
+    """What is learned beside a known model, one draw for each start."""
+
+    def when(self, job: Job) -> bool:
+        """Whether there is a known model."""
+        return job.settings.known is not None
+
+    def run(self, job: Job) -> Job:
+        """The models with it, or the known model alone."""
+        settings, model = job.settings, job.models[0]
+        if _grey(settings):
+            settings, models = replace(settings, starts=1, ridge=0.0), [model]
+        else:
+            settings = replace(settings, starts=_asked(settings))
+            train = in_windows(job.dataset.train, settings.horizon)
+            models = [with_learned(model, train, settings, seed) for seed in settings.seeds]
+        for model in models:
+            model.lfr.to(device=settings.device, dtype=settings.dtype)
+        return replace(job, settings=settings, models=models, ridge=None)
+
+
+def _grey(settings: Settings) -> bool:
+    """Whether nothing is learned beside the known model."""
+    return settings.nn == 0 and not settings.nx and settings.static == "network"
+
+
+def _asked(settings: Settings) -> int:
+    """Number of starts."""
+    return _STARTS if settings.starts == "auto" else settings.starts
+
+
+def _count(settings: Settings) -> int:
+    """Number of values that the parameters start from."""
+    if not cast(Known, settings.known).parameters:
+        return 1
+    return _asked(settings) if _grey(settings) else _STARTS
 
 
 def physical(model: Model) -> dict[str, float]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import cast
 
 import torch
 
@@ -16,26 +17,95 @@ from lfrtorch.fitting.first_fit import cost_in_full
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.prediction import predicting
 from lfrtorch.fitting.refit import refit
-from lfrtorch.fitting.stage import Stage
+from lfrtorch.fitting.stage import Job, Stage
 from lfrtorch.fitting.state_scaling import scale_states
 from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.least_squares.problem import Problem
-from lfrtorch.records import common_unit
+from lfrtorch.least_squares.ridge import Ridge
+from lfrtorch.records import Record, common_unit
 
 _AVERAGED, _POOR = 3, 2.0
 """Starts of a mean that no held-out record judges, and their training errors over the least, at
 most: the start with the least may be the one that is overfitted (``benchmarks/first_try.md``)."""
 
 
-def without_poor_starts(stage: Stage, result: FitResult) -> FitResult:
+class MeanOfGood(Stage):
+    """The mean of the few starts with the least training errors, of a model of chosen sizes."""
+
+    def when(self, job: Job) -> bool:
+        """Whether no held-out record has judged a mean."""
+        return job.choice is not None and bool(job.result.members)
+
+    def run(self, job: Job) -> Job:
+        """Leave out poor starts."""
+        return replace(job, result=without_poor_starts(job.result, job.dataset.train))
+
+
+class Refit(Stage):
+    """A last fit to all estimation records."""
+
+    def when(self, job: Job) -> bool:
+        """Whether it is asked for, and records were held out."""
+        if not job.settings.refit or job.result.reason in CUT_SHORT:
+            return False
+        if not (job.given.validation or job.given.selection):
+            job.observer.say(
+                "note: refit: there are no validation records, so all were fitted before"
+            )
+            return False
+        return True
+
+    def run(self, job: Job) -> Job:
+        """The fit and that to all records; without it if the model that was chosen stays."""
+        # A fit that was interrupted here has that for its reason. Records have no windows for
+        # scores: what need not be skipped is fitted.
+        settings, dataset, result = job.settings, job.given, job.result
+        held_out = [*dataset.validation, *dataset.selection]
+        again = _whole_or_cut(
+            result,
+            partial(
+                refit,
+                result,
+                dataset.train,
+                held_out,
+                trainer=settings.trainer,
+                ridge=cast(Ridge, settings.ridge),
+                noise=settings.noise,
+                horizon=settings.horizon,
+                iterations=result.chosen_iteration + cost_in_full(settings),
+                monitor=job.observer.searching(),
+                stop=job.stop,
+            ),
+        )
+        if again.reason in CUT_SHORT:
+            return replace(job, result=again)
+        records = [*dataset.train, *held_out]
+        margins = torch.tensor(
+            [largest_stable_amplitude(m, records) for m in (again.model, result.model)]
+        )
+        if bool(torch.lt(*agreed(margins))):
+            job.observer.say(
+                "note: refit: the model would become unstable on louder inputs; that before it "
+                "stays"
+            )
+            return job
+        before, after = (again.history[i].train for i in (0, again.chosen_iteration))
+        unit = common_unit(again.model.outputs)
+        job.observer.say(
+            f"refit to all estimation records: {again.iterations} iterations, "
+            f"{quantity(again.seconds, 's')}, their error {quantity(before, unit)} -> "
+            f"{quantity(after, unit)}; validation errors are those before it"
+        )
+        return replace(job, again=again)
+
+
+def without_poor_starts(result: FitResult, train: Sequence[Record]) -> FitResult:
     """The fit whose mean is of the few starts with the least training errors."""
-    members, train = list(result.members[:_AVERAGED]), stage.dataset.train
-    if not members:
-        return result
+    members = list(result.members[:_AVERAGED])
     predicts = result.model.K is not None  # gains of models do not make one of their mean
-    models, train = predicting(members, train) if predicts else (members, train)
+    models, data = predicting(members, train) if predicts else (members, train)
     assert isinstance(models, list)
-    judges = [Problem.judge(model, train) for model in models]
+    judges = [Problem.judge(model, data) for model in models]
     costs = torch.tensor([j.evaluate(j.theta).cost for j in judges], dtype=torch.float64)
     costs = agreed(costs.nan_to_num(torch.inf))  # the simulation of some may run away
     near = int((costs <= _POOR**2 * costs.min()).sum())
@@ -43,55 +113,11 @@ def without_poor_starts(stage: Stage, result: FitResult) -> FitResult:
         return result
     order = costs.argsort(stable=True)[:near].tolist()
     mean = models[order[0]] if near == 1 else mean_model([models[i] for i in order])
-    given = any(record.start == "given" for record in train)
-    scale_states(mean, train, keep_coordinates=given)
+    given = any(record.start == "given" for record in data)
+    scale_states(mean, data, keep_coordinates=given)
     mean = mean.innovation_form() if predicts else mean
     kept = tuple(members[i] for i in order) if near > 1 else ()
     return replace(result, model=mean, averaged=near, members=kept)
-
-
-def refitted(stage: Stage, result: FitResult) -> tuple[FitResult, FitResult | None]:
-    """The fit and that to all estimation records; None if the model that was chosen stays."""
-    # A fit that was interrupted here has that for its reason. The stage has the records without
-    # windows for scores: what need not be skipped is fitted.
-    dataset, settings, observer = stage.dataset, stage.settings, stage.observer
-    held_out = [*dataset.validation, *dataset.selection]
-    if result.reason in CUT_SHORT:
-        return result, None
-    if not held_out:
-        observer.say("note: refit: there are no validation records, so all were fitted before")
-        return result, None
-    again = _whole_or_cut(
-        result,
-        partial(
-            refit,
-            result,
-            dataset.train,
-            held_out,
-            iterations=result.chosen_iteration + cost_in_full(settings),
-            monitor=observer.searching(),
-            **stage.options,
-        ),
-    )
-    if again.reason in CUT_SHORT:
-        return again, None
-    records = [*dataset.train, *held_out]
-    margins = torch.tensor(
-        [largest_stable_amplitude(m, records) for m in (again.model, result.model)]
-    )
-    if bool(torch.lt(*agreed(margins))):
-        observer.say(
-            "note: refit: the model would become unstable on louder inputs; that before it stays"
-        )
-        return result, None
-    before, after = (again.history[i].train for i in (0, again.chosen_iteration))
-    unit = common_unit(again.model.outputs)
-    observer.say(
-        f"refit to all estimation records: {again.iterations} iterations, "
-        f"{quantity(again.seconds, 's')}, their error {quantity(before, unit)} -> "
-        f"{quantity(after, unit)}; validation errors are those before it"
-    )
-    return result, again
 
 
 def _whole_or_cut(before: FitResult, again: Callable[[], FitResult]) -> FitResult:

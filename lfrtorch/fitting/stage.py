@@ -1,44 +1,140 @@
-"""What the stages of a job share: sizes, a first part, the fit, one model for a mean, a refit."""
+"""Stages of an identification, each a file: what comes before a fit, the fits, and what follows.
+
+A fit says when it is made, to which data, by which trainer, and what is kept of it:
+
+    class Reweighted(Stage):
+        name = "the fit to records weighted by their errors"
+
+        def data(self, job):
+            return Data([replace(r, weight=...) for r in job.dataset.train])
+
+        def keep(self, job, result):
+            return replace(job, models=[result.model])
+
+Others override ``run``. ``stages.STAGES`` has them all in their order, and asks no more of them.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TypedDict, cast
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
+from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch.dataset import Dataset
+from lfrtorch.fitting.choice import Choice
+from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.observer import Observer
-from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.fitting.settings import Settings
-from lfrtorch.fitting.trainer import Stop, Trainer
+from lfrtorch.fitting.snapshots import Snapshots
+from lfrtorch.fitting.trainer import FitResult, Stop, StoppedError, Trainer
 from lfrtorch.least_squares.ridge import Ridge
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.order_scan import OrderScan
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+_LATER: Any = None
+"""Of a field that a later stage fills."""
 
 
-class FitOptions(TypedDict):
-    """Keywords of every fit of a job, see :func:`lfrtorch.fit`."""
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """An identification as far as it has come; the settings have what was chosen so far.
 
-    trainer: Trainer
-    ridge: Ridge
-    noise: Noise
-    horizon: int | None
-    stop: Stop | None
+    Args:
+        given: records by use, as they were given.
+        dataset: the same with the windows of their scores.
+        settings, observer, stop, snapshots: see :func:`lfrtorch.identify`.
+        linear: the best linear approximation.
+        begun: that of the order that models start with.
+        order_scan, choice: of its order, and of the sizes.
+        models: where the next fit starts.
+        ridge: of the next fit, if it is another than in the settings.
+        result, again: the fit, and that to all estimation records.
+    """
 
-
-@dataclass(frozen=True)
-class Stage:
-    """What a stage is given, and hands on; the settings are as far as they are chosen."""
-
+    given: Dataset
     dataset: Dataset
     settings: Settings
     observer: Observer
-    stop: Stop | None
+    stop: Stop | None = None
+    snapshots: Snapshots | None = None
+    linear: LinearModel = _LATER
+    begun: LinearModel = _LATER
+    order_scan: OrderScan | None = None
+    choice: Choice | None = None
+    models: Sequence[Model] = ()
+    ridge: Ridge | None = None
+    result: FitResult = _LATER
+    again: FitResult | None = None
 
-    @property
-    def options(self) -> FitOptions:
-        """Keywords of its fit."""
-        return {
-            "trainer": self.settings.trainer,
-            "ridge": cast(Ridge, self.settings.ridge),  # chosen before a fit begins
-            "noise": self.settings.noise,
-            "horizon": self.settings.horizon,
-            "stop": self.stop,
-        }
+    def fit(self, models: Sequence[Model], data: Data, **options: Any) -> FitResult:
+        """A fit with the settings, but for the options."""
+        own = {name: getattr(self.settings, name) for name in ("noise", "horizon")}
+        own["ridge"] = self.settings.ridge if self.ridge is None else self.ridge
+        return fit(models, *data, **{**own, "stop": self.stop, **options})
+
+
+class Data(NamedTuple):
+    """Records of a fit by use."""
+
+    train: Sequence[Record]
+    validation: Sequence[Record] = ()
+    selection: Sequence[Record] = ()
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> Data:
+        """Those of a dataset."""
+        return cls(dataset.train, dataset.validation, dataset.selection)
+
+
+class Stage:
+    """One of them; a fit, unless it overrides ``run``."""
+
+    name = ""
+    """What it is, after "stopped during"."""
+
+    def check(self, job: Job) -> None:
+        """Refuse what cannot be, before anything is computed."""
+
+    def when(self, job: Job) -> bool:
+        """Whether it takes part."""
+        return True
+
+    def data(self, job: Job) -> Data:
+        """What it fits."""
+        return Data.of(job.dataset)
+
+    def trainer(self, job: Job) -> Trainer:
+        """The search."""
+        return job.settings.trainer
+
+    def options(self, job: Job) -> Mapping[str, Any]:
+        """Other keywords of its fit, in place of the settings."""
+        return {}
+
+    def keep(self, job: Job, result: FitResult) -> Job:
+        """What comes of it."""
+        raise NotImplementedError
+
+    def run(self, job: Job) -> Job:
+        """The job after the stage."""
+        monitor = job.observer.searching()
+        result = job.fit(
+            job.models,
+            self.data(job),
+            trainer=self.trainer(job),
+            monitors=None if monitor is None else [[monitor]] * len(job.models),
+            **self.options(job),
+        )
+        if result.reason in CUT_SHORT:
+            raise StoppedError(f"stopped during {self.name}")
+        return self.keep(job, result)
+
+
+def best_start(job: Job, result: FitResult) -> tuple[Settings, list[Model]]:
+    """The best start, and the settings with its seed."""
+    best = result.starts[0].number if result.starts else 0
+    settings = job.settings
+    return replace(settings, seed=settings.seeds[best], starts=1), [result.model]

@@ -96,6 +96,13 @@ def windows(
     return found
 
 
+def in_windows(records: Sequence[Record], horizon: int | None) -> Sequence[Record]:
+    """Training records as a fit simulates them: in windows if they begin at outputs, else whole."""
+    if horizon is None or any(record.start != "measured" for record in records):
+        return records
+    return windows(records, horizon, records[0].y.shape[1])
+
+
 def windows_from_outputs(
     record: Record, horizon: int, apart: int, y_scale: Array | None
 ) -> list[Record]:

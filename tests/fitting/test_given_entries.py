@@ -10,7 +10,7 @@ import pytest
 from reference import measure, random_cell, random_model
 
 import lfrtorch
-from lfrtorch import Dataset, InputError, Record, Settings, initialise, job
+from lfrtorch import Dataset, InputError, Record, Settings, initialise
 from lfrtorch.fitting.given_entries import with_given
 
 NAN = float("nan")
@@ -116,6 +116,6 @@ def test_what_is_no_matrix_is_refused(given: dict[str, Any], message: str):
 def test_settings_are_refused_before_any_fit(
     settings: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(job, "linear_model", None)
+    monkeypatch.setattr("lfrtorch.fitting.linear_start.linear_model", None)
     with pytest.raises(InputError, match=message):
         identified(**settings)

@@ -8,11 +8,7 @@ import scipy
 import torch
 
 import lfrtorch
-from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.last_fits import without_poor_starts
-from lfrtorch.fitting.observer import Observer
-from lfrtorch.fitting.settings import Settings
-from lfrtorch.fitting.stage import Stage
 
 
 @pytest.mark.parametrize(
@@ -29,8 +25,7 @@ def test_a_start_whose_simulation_runs_away_is_in_no_mean(
     for k in runs_away:
         with torch.no_grad():
             models[k].lfr.cell.A.fill_(torch.nan)
-    stage = Stage(Dataset("made", [record], [], []), Settings(nx=1), Observer(), None)
-    found = without_poor_starts(stage, replace(result, members=tuple(models), averaged=3))
+    found = without_poor_starts(replace(result, members=tuple(models), averaged=3), [record])
     assert found.averaged == len(kept)
     if len(kept) == 1:
         assert found.model is models[kept[0]]

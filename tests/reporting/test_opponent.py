@@ -76,7 +76,7 @@ def test_no_second_linear_model_is_made_where_it_is_the_same(
 ):
     made = []
     estimate = lfrtorch.estimate_bla
-    for where in ("lfrtorch.job", "lfrtorch.reporting.opponent"):
+    for where in ("lfrtorch.fitting.linear_start", "lfrtorch.reporting.opponent"):
         monkeypatch.setattr(
             f"{where}.estimate_bla", lambda *a, **k: (made.append(1), estimate(*a, **k))[1]
         )

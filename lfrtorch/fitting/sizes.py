@@ -1,0 +1,103 @@
+"""The choice of sizes and ridge, on all records but the tests, before the fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, cast
+
+from lfrtorch.fitting.choice import Choice, choose_sizes
+from lfrtorch.fitting.exclusions import allowed
+from lfrtorch.fitting.first_fit import part_of
+from lfrtorch.fitting.given_entries import with_given
+from lfrtorch.fitting.linear_start import linear_records, tell
+from lfrtorch.fitting.observer import Observer
+from lfrtorch.fitting.refit import estimation_records
+from lfrtorch.fitting.settings import Settings
+from lfrtorch.fitting.stage import Job, Stage
+from lfrtorch.fitting.start_models import STARTS_OF_CHOSEN, starting_model
+from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+_CHOOSING = 20_000
+"""Training samples that sizes are chosen with, at most."""
+
+_ITERATIONS = 75
+"""Of a fit that no validation record ends: about as many as its ridge was chosen with."""
+
+
+class Sizes(Stage):
+    """Sizes and ridge that are ``"auto"``, by cross-validation."""
+
+    def when(self, job: Job) -> bool:
+        """Whether any is."""
+        return bool(job.settings.searched)
+
+    def run(self, job: Job) -> Job:
+        """Choose, and estimate the linear models again: all records but the tests are fitted."""
+        train = estimation_records(job.dataset)
+        dataset = replace(job.dataset, train=train, validation=[], selection=[])
+        choice = _choice(replace(job, dataset=dataset))
+        settings = _of_choice(job.settings, choice)
+        records = linear_records(train, settings, Observer())
+        estimate = partial(estimate_bla, records, **settings.linear)
+        linear = estimate(choice.nx)
+        begun = linear if settings.nx == choice.nx else estimate(cast(int, settings.nx))
+        tell(linear, job.observer)
+        found = {"linear": linear, "begun": begun, "choice": choice}
+        return replace(job, dataset=dataset, settings=settings, **found)
+
+
+def _of_choice(settings: Settings, choice: Choice) -> Settings:
+    """The settings with what was chosen; the fit has no validation records."""
+    trainer: Any = settings.trainer
+    averages = allowed("average", STARTS_OF_CHOSEN, vars(settings))
+    return replace(
+        settings,
+        **choice.chosen.sizes,
+        ridge=choice.chosen.ridge,
+        average=STARTS_OF_CHOSEN if settings.static == "network" and averages else 1,
+        refit=False,
+        trainer=replace(trainer, max_iter=min(trainer.limit, _ITERATIONS)),
+    )
+
+
+def _choice(job: Job) -> Choice:
+    """Choose the sizes that are ``"auto"``, and the ridge, by cross-validation."""
+    dataset, settings, observer = job.dataset, job.settings, job.observer
+    samples = sum(record.samples for record in dataset.train)
+    part = min(1.0, _CHOOSING / samples)
+    records = dataset.train if part == 1.0 else part_of(dataset.train, part)
+    if part < 1.0:
+        some = sum(record.samples for record in records)
+        observer.say(f"sizes are chosen on {some} of {samples} training samples")
+    orders = job.order_scan.orders if job.order_scan else ()
+    given = {name: size for name, size in settings.sizes.items() if isinstance(size, int)}
+    approximated = linear_records(records, settings, Observer())
+
+    def approximation(nx: int) -> LinearModel:
+        return estimate_bla(approximated, nx, **settings.linear)
+
+    def start(bla: LinearModel, train: Sequence[Record], sizes: dict[str, int], seed: int) -> Model:
+        begun = starting_model(train, replace(settings, nx=bla.nx, **sizes), bla, seed)
+        return with_given(begun, settings.fixed)[0]
+
+    searched = settings.nx == "auto"
+    choice = choose_sizes(
+        records,
+        [nx for nx in orders if nx <= job.linear.nx] if searched else [job.linear.nx],
+        approximation,
+        start,
+        given=given,
+        ridge=0.0 if settings.ridge == "auto" else settings.ridge,
+        last=settings.size_names[-1],
+        seed=settings.seed,
+        guarantee="stable" if settings.trainer.guarantee == "stable" else None,
+        watch=observer.say,
+        stop=job.stop,
+    )
+    observer.say(choice.table())
+    return choice

@@ -1,0 +1,84 @@
+"""Where the fits of an identification start: a given model, or a linear one with static maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import fields, replace
+from inspect import signature
+
+import torch
+
+from lfrtorch.fitting.multistart import cheap_starts
+from lfrtorch.fitting.plain_settings import PlainSettings
+from lfrtorch.fitting.settings import Settings
+from lfrtorch.fitting.stage import Job, Stage
+from lfrtorch.fitting.starts import initialise
+from lfrtorch.fitting.windows import in_windows
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model, check_channels
+from lfrtorch.records import Record
+
+STARTS_OF_CHOSEN = 4
+"""Starts of a model of chosen sizes, at least; all go to the end, where it shows which are good."""
+
+
+class FromModel(Stage):
+    """The model of ``init_from``."""
+
+    def check(self, job: Job) -> None:
+        """Refuse a model of other channels."""
+        if job.settings.init_from is not None:
+            check_channels(job.settings.init_from, job.given.train[0])
+
+    def when(self, job: Job) -> bool:
+        """Whether there is one."""
+        return job.settings.init_from is not None
+
+    def run(self, job: Job) -> Job:
+        """Start there alone."""
+        settings = job.settings
+        if settings.starts not in (1, "auto"):
+            job.observer.say("note: starts is 1: the fit starts from the model of init_from alone")
+        model = deepcopy(settings.init_from)
+        assert model is not None
+        model.lfr.to(device=settings.device, dtype=settings.dtype)
+        return replace(job, settings=replace(settings, starts=1), models=[model])
+
+
+class FromLinear(Stage):
+    """The linear model with random static maps, one for each start."""
+
+    def when(self, job: Job) -> bool:
+        """Whether nothing else is given to start from."""
+        return job.settings.init_from is None and job.settings.known is None
+
+    def run(self, job: Job) -> Job:
+        """Make the models."""
+        settings, begun = job.settings, job.begun
+        train = in_windows(job.dataset.train, settings.horizon)
+        first = starting_model(train, settings, begun, settings.seed)
+        count = settings.starts
+        if count == "auto":
+            rows = sum(record.y.size for record in train)
+            count = cheap_starts(rows, first.parameter_count, settings.trainer.limit)
+        if job.choice is not None:
+            count = max(STARTS_OF_CHOSEN, count)
+            settings = replace(settings, average=count if settings.average > 1 else 1)
+        settings = replace(settings, starts=count)
+        more = [starting_model(train, settings, begun, seed) for seed in settings.seeds[1:]]
+        return replace(job, settings=settings, models=[first, *more])
+
+
+def starting_model(
+    train: Sequence[Record], settings: Settings, linear: LinearModel, seed: int
+) -> Model:
+    """The model that one start begins with."""
+    names = {one.name for one in fields(PlainSettings)} & {*signature(initialise).parameters}
+    options = {name: getattr(settings, name) for name in names}
+    with torch.random.fork_rng(devices=[]):  # maps draw their weights as torch modules do
+        torch.manual_seed(seed)
+        options |= settings.static_map()
+    model = initialise(linear, train, **options | {"method": settings.init, "seed": seed})
+    model.lfr.to(device=settings.device, dtype=settings.dtype)
+    return model

@@ -1,0 +1,159 @@
+"""The scores, verdict and advice of an identification."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import cast
+
+from lfrtorch._support.threads import each_alone
+from lfrtorch.analysis.physical_parameters import physical_parameters
+from lfrtorch.dataset import Dataset
+from lfrtorch.fitting.forgetting import forgets
+from lfrtorch.fitting.from_outputs import begins_at_outputs
+from lfrtorch.fitting.linear_start import linear_records, of_linear_model, tell
+from lfrtorch.fitting.observer import Observer
+from lfrtorch.fitting.refit import estimation_records
+from lfrtorch.fitting.settings import Settings
+from lfrtorch.fitting.stage import Job
+from lfrtorch.fitting.windows import windows
+from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.order_scan import OrderScan
+from lfrtorch.reporting.advice import advise
+from lfrtorch.reporting.diagnosis import evidence
+from lfrtorch.reporting.evaluation import (
+    HORIZONS,
+    Evaluation,
+    cross_validated,
+    worst_residuals,
+)
+from lfrtorch.reporting.opponent import Opponents, opponents
+from lfrtorch.reporting.run import Run
+from lfrtorch.reporting.scores import metrics
+from lfrtorch.reporting.verdict import REMEMBERS, judge, judge_predictions
+
+
+def scored_run(job: Job) -> Run:
+    """Score all records, the tests by the model fitted again; add verdict and advice."""
+    dataset, settings, linear, result = job.dataset, job.settings, job.linear, job.result
+    order_scan, choice, again = job.order_scan, job.choice, job.again
+    in_turn = choice is not None and not dataset.tests  # what was left out judges
+    scan = None if in_turn else order_scan
+    opposed = linear_opponents(dataset, settings, linear, scan, job.observer)
+    samples = sum(record.samples for record in dataset.train)
+    fitted_to = f"{dataset.name}: {len(dataset.train)} record(s), {samples} samples"
+    model = replace(result.model, fitted_to=fitted_to).reaching(dataset.train)
+    result = replace(result, model=model)
+    if again is not None:
+        fitted_to += " and all other estimation records"
+        known = [*dataset.train, *dataset.validation, *dataset.selection]
+        again = replace(again, model=replace(again.model, fitted_to=fitted_to).reaching(known))
+    evaluation = Evaluation(
+        dataset=dataset,
+        linear=opposed[None],
+        predictors=opposed,
+        model=result.model,
+        refitted=None if again is None else again.model,
+        own=linear_models_of_tests(dataset, settings),
+        horizon=settings.horizon,
+        left_out=() if choice is None else cross_validated(choice.left_out),
+    )
+    judged = simulations = evaluation.simulations
+    ahead = settings.horizon if begins_at_outputs(dataset.train) else None
+    opponent = opposed[None]
+    memory = None
+    if settings.noise == "output" and settings.horizon is None:
+        seen = dataset.train if again is None else estimation_records(dataset)
+        memory = forgets((again or result).model, seen, opponent)
+    refusals = [REMEMBERS] if memory is not None and not memory.right else []
+    if settings.noise == "output" or in_turn:
+        error = "error" if ahead is None else f"error {ahead} samples ahead"
+        verdict = judge(result, simulations, linear_nx=opponent.nx, error=error, refusals=refusals)
+    else:
+        opponent = opposed[HORIZONS[0]]
+        judged = evaluation.predictions[HORIZONS[0]]
+        verdict = judge_predictions(result, evaluation.predictions, linear_nx=opponent.nx)
+    residuals = worst_residuals(judged)
+    found = evidence(
+        result,
+        judged,
+        bla=linear,
+        noise_rms=dataset.noise_rms,
+        continued=settings.init_from is not None,
+        ridge=settings.ridge != 0.0,
+        searched=choice is not None or ahead is not None,
+        trainer=settings.trainer,
+        verdict=verdict,
+        residuals=residuals,
+    )
+    known = None
+    if model.known_states:
+        of = dataset.train if again is None else estimation_records(dataset)
+        ridge = 0.0 if isinstance(settings.ridge, Mapping | str) else settings.ridge
+        if begins_at_outputs(of) and settings.horizon is not None:
+            of = windows(of, settings.horizon, model.lfr.cell.nx, y_scale=model.scaler.y_scale)
+        known = physical_parameters((again or result).model, of, ridge=ridge)
+    numbers = metrics(
+        result,
+        evaluation,
+        settings=settings,
+        choice=choice,
+        verdict=verdict,
+        refit=again,
+        residuals=residuals,
+        parameters=known,
+        memory=memory,
+    )
+    return Run(
+        dataset=dataset,
+        settings=settings,
+        linear=opponent,
+        order_scan=order_scan,
+        choice=choice,
+        fit=result,
+        refit=again,
+        evaluation=evaluation,
+        residuals=residuals,
+        parameters=known,
+        memory=memory,
+        metrics=numbers,
+        verdict=verdict,
+        advice=advise(found),
+    )
+
+
+def linear_opponents(
+    dataset: Dataset,
+    settings: Settings,
+    linear: LinearModel,
+    scan: OrderScan | None,
+    observer: Observer,
+) -> Opponents:
+    """The linear models that the NL-LFR is compared with, of the order that a scan chose."""
+    ahead = () if settings.noise == "output" else HORIZONS
+    if begins_at_outputs(dataset.train):
+        return dict.fromkeys((None, *ahead), linear)
+    nx = linear.nx if scan is None else scan.chosen
+    records = linear_records(dataset.train, replace(of_linear_model(settings), nx=nx), Observer())
+    found = opponents(linear, records, dataset, nx=nx, options=settings.linear, ahead=ahead)
+    others = {id(model): model for model in found.values() if model is not linear}
+    for model in others.values():
+        observer.say("another linear model does better than the start; it is the one compared with")
+        tell(model, observer)
+    return found
+
+
+def linear_models_of_tests(dataset: Dataset, settings: Settings) -> dict[str, LinearModel]:
+    """Linear models of single tests, if ``dataset.linear`` asks for them, by the test's name."""
+    options = {**settings.linear}
+    if settings.noise == "output" and options.get("refine") == "prediction":
+        options["refine"] = None  # simulations are judged
+    records = {record.name: record for record in dataset.train}
+    # Tests that share their records share the model.
+    of = list(dict.fromkeys(dataset.linear.values()))
+    estimate = partial(estimate_bla, nx=cast(int, of_linear_model(settings).nx), **options)
+    models = each_alone(estimate, [[records[name] for name in names] for names in of])
+    by_records = dict(zip(of, models, strict=True))
+    return {test: by_records[names] for test, names in dataset.linear.items()}
