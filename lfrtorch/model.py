@@ -20,6 +20,7 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, reals
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.frames import check_index, columns_of, framed, is_frame, places_of
+from lfrtorch._support.old_checkpoints import SCALING, innermost, of_today
 from lfrtorch._support.types import Array
 from lfrtorch.data_reach import Cloud, DataReach
 from lfrtorch.engine import held
@@ -79,9 +80,6 @@ _TOGETHER = 1000
 
 if TYPE_CHECKING:
     from pandas import DataFrame
-
-
-_SCALING = ("u_offset", "u_scale", "y_offset", "y_scale")  # fields of a Scaler, in a checkpoint
 
 
 def simulate_record(lfr: LFR, normalised: NormalisedRecord, start: Start) -> Trajectory:
@@ -749,24 +747,7 @@ class Model:
             >>> np.array_equal(again.simulate(record), model.simulate(record))
             True
         """
-        cell, s = self.lfr.cell, self.scaler
-        description = {
-            "sizes": {"nu": cell.nu, "ny": cell.ny, "nx": cell.nx, "nz": cell.nz, "nw": cell.nw},
-            "static": cell.map.describe(),
-            "dtype": str(cell.A.dtype).removeprefix("torch."),
-            "fs": self.fs,
-            "inputs": [c._asdict() for c in self.inputs],
-            "outputs": [c._asdict() for c in self.outputs],
-        }
-        description |= {"fitted_to": self.fitted_to} if self.fitted_to else {}
-        weights = dict(self.lfr.cell.state_dict())
-        weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in _SCALING}
-        weights |= {f"fixed.{name}": mask.to(cell.A) for name, mask in cell.held.items()}
-        if self.K is not None:
-            weights["K"] = self.K
-        if self.reach is not None:
-            weights |= {f"reach.{name}": torch.tensor(v) for name, v in _flat(self.reach).items()}
-        return checkpoint.write(folder, description, weights)
+        return write_model(folder, self)
 
 
 @typed()
@@ -827,24 +808,11 @@ def state_moment(model: Model, records: Record | Sequence[Record]) -> Float[Tens
     return (total + total.mT) / (2 * samples)
 
 
-def _folded(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The weights of a model with f in the place of its map w = W (f(Z z) - L Z z)."""
-    L, Z, W = (weights.pop(f"static.{name}") for name in ("slope", "into", "out"))
-    found = {name.replace("static.base.", "static.", 1): weight for name, weight in weights.items()}
-    for name in ("Cz", "Dzu", "reach.middle"):
-        found |= {name: Z @ found[name]} if name in found else {}
-    if "reach.axes" in found:
-        found["reach.axes"] = found["reach.axes"] @ torch.linalg.inv(Z)
-    for into, of_x, of_u in (("Bw", "A", "Bu"), ("Dyw", "Cy", "Dyu")):
-        found[into] = found[into] @ W
-        found[of_x] = found[of_x] - found[into] @ L @ found["Cz"]
-        found[of_u] = found[of_u] - found[into] @ L @ found["Dzu"]
-    return found
-
-
 @typed()
 def load(folder: str | Path, *, static: Module | None = None) -> Model:
     """The model in a checkpoint folder, or in the ``model/`` folder of a run's folder.
+
+    A linear model is one without a static map; ``LinearModel.load`` has its covariance as well.
 
     Args:
         folder: where it was saved.
@@ -852,23 +820,52 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             checkpoint holds weights, never code.
 
     Raises:
-        ValueError: no checkpoint, a damaged one, one of another program or a newer version, one
-            that holds a linear model, or a file that may carry code (it is not opened).
+        ValueError: no checkpoint, a damaged one, one of another program or a newer version, or a
+            file that may carry code (it is not opened).
 
     Example:
         >>> folder = model.save("model")
         >>> lfrtorch.load(folder).sizes
         {'nx': 1, 'nz': 1, 'nw': 1, 'nn': 4}
     """
-    description, weights = checkpoint.read(folder)
-    if "linear" in description:
-        raise InputError(
-            f"'{folder}' holds a linear model, as estimate_bla makes it; "
-            "read it with lfrtorch.LinearModel.load."
-        )
-    own, folds = description.get("static"), 0
-    while isinstance(own, dict) and own.get("type") == "Beyond":  # canonical forms of before
-        own, folds = own.get("base"), folds + 1
+    return read_model(folder, static=static)[0]
+
+
+def write_model(
+    folder: str | Path,
+    model: Model,
+    about: Mapping[str, Any] | None = None,
+    known: Mapping[str, Tensor] | None = None,
+) -> Path:
+    """Write the checkpoint of a model, and what is known of a linear one beside its numbers."""
+    cell, s = model.lfr.cell, model.scaler
+    description = {
+        "sizes": {"nu": cell.nu, "ny": cell.ny, "nx": cell.nx, "nz": cell.nz, "nw": cell.nw},
+        "static": cell.map.describe(),
+        "dtype": str(cell.A.dtype).removeprefix("torch."),
+        "fs": model.fs,
+        "inputs": [c._asdict() for c in model.inputs],
+        "outputs": [c._asdict() for c in model.outputs],
+    }
+    description |= {"fitted_to": model.fitted_to} if model.fitted_to else {}
+    description |= {} if about is None else {"linear": dict(about)}
+    weights = dict(cell.state_dict())
+    weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in SCALING}
+    weights |= {f"fixed.{name}": mask.to(cell.A) for name, mask in cell.held.items()}
+    weights |= {f"linear.{name}": tensor for name, tensor in (known or {}).items()}
+    if model.K is not None:
+        weights["K"] = model.K
+    if model.reach is not None:
+        weights |= {f"reach.{name}": torch.tensor(v) for name, v in _flat(model.reach).items()}
+    return checkpoint.write(folder, description, weights)
+
+
+def read_model(
+    folder: str | Path, *, static: Module | None = None, inside: Sequence[str] = ("model", "linear")
+) -> tuple[Model, dict[str, Any] | None, dict[str, Tensor]]:
+    """The model in a checkpoint, and what ``write_model`` was given of it besides."""
+    description, weights = checkpoint.read(folder, inside)
+    own = innermost(description)
     if not static and (name := foreign(own)):
         raise InputError(
             f"'{folder}' holds a static nonlinearity of class {name}, which is not part of this "
@@ -880,42 +877,58 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             "networks of one; fit again with a torch module of your own: static=own."
         )
     try:
-        sizes = description["sizes"]
-        dtype = getattr(torch, description["dtype"])
-        if not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
-            raise InputError(f"dtype is {description['dtype']}")
-        finite = [name for name in weights if not name.endswith(".bounds")]
-        lost = [name for name in finite if not weights[name].isfinite().all()]
-        if lost:
-            raise InputError(f"{', '.join(lost)} have numbers that are not finite")
-        for _ in range(folds):
-            weights = _folded(weights)
-        scaler = Scaler(*(weights.pop(f"scaler.{name}").numpy() for name in _SCALING))
-        if weights["A"].shape != (sizes["nx"],) * 2:
-            raise InputError("they are of other sizes")
-        static = made(own, sizes["nz"], sizes["nw"], dtype, static)
-        cell = LFRCell(**sizes, static=static, dtype=dtype, random=False).to(dtype)
-        K = weights.pop("K", None)
-        masks = {
-            name.removeprefix("fixed."): weights.pop(name) != 0
-            for name in [n for n in weights if n.startswith("fixed.")]
-        }
-        parts = [f"reach.{name}" for name in ("u", "y", "middle", "axes", "ends", "farthest")]
-        reach = None
-        if parts[0] in weights:
-            of_u, of_y, middle, axes, ends, far = (weights.pop(name).numpy() for name in parts)
-            reach = DataReach(of_u, of_y, Cloud(middle, axes, ends, float(far)))
-        weights.setdefault("state_covariance", torch.eye(cell.nx))  # checkpoints of before
-        cell.load_state_dict(weights)
-        _hold_again(cell, masks, description)
-        inputs, outputs = (described_channels(description[side]) for side in ("inputs", "outputs"))
-        fitted_to = str(description.get("fitted_to", ""))
-        fs = float(description["fs"])
-        return Model(LFR(cell), scaler, fs, inputs, outputs, fitted_to, K, reach)
+        description, weights = of_today(description, weights)
+        known = _under(weights, "linear.")
+        about = description.get("linear")
+        if not isinstance(about, dict | None):
+            raise InputError(f"linear is {about!r}")
+        return _made(description, weights, static), about, known
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise InputError(
             f"'{folder}' is damaged: its description and weights do not fit ({brief(error)})."
         ) from None
+
+
+def _made(description: dict[str, Any], weights: dict[str, Tensor], static: Module | None) -> Model:
+    """The model of a description and its weights."""
+    sizes, dtype = description["sizes"], getattr(torch, description["dtype"])
+    if not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
+        raise InputError(f"dtype is {description['dtype']}")
+    lost = [n for n, w in weights.items() if not n.endswith(".bounds") and not w.isfinite().all()]
+    if lost:
+        raise InputError(f"{', '.join(lost)} have numbers that are not finite")
+    scaler = Scaler(*(weights.pop(f"scaler.{name}").numpy() for name in SCALING))
+    if weights["A"].shape != (sizes["nx"],) * 2:
+        raise InputError("they are of other sizes")
+    static = made(description["static"], sizes["nz"], sizes["nw"], dtype, static)
+    cell = LFRCell(**sizes, static=static, dtype=dtype, random=False).to(dtype)
+    K, masks, parts = weights.pop("K", None), _under(weights, "fixed."), _under(weights, "reach.")
+    reach = None
+    if parts:
+        names = ("u", "y", "middle", "axes", "ends", "farthest")
+        of_u, of_y, middle, axes, ends, far = (parts[name].numpy() for name in names)
+        reach = DataReach(of_u, of_y, Cloud(middle, axes, ends, float(far)))
+    cell.load_state_dict(weights)
+    named = description.get("structure", "free")
+    if named not in held.STRUCTURES:
+        raise InputError(f"structure is {named!r}")
+    z, y = (description.get(name, True) for name in ("z_feedthrough", "feedthrough"))
+    for given in (
+        {name: (mask != 0, cell.get_parameter(name).detach()) for name, mask in masks.items()},
+        held.structure(cell, named),  # of checkpoints of before, as what follows
+        held.no_feedthrough(cell, z=z, y=y),
+        held.integrators(cell) if cell.nw else {},
+    ):
+        cell.hold(given)
+    inputs, outputs = (described_channels(description[side]) for side in ("inputs", "outputs"))
+    about = float(description["fs"]), inputs, outputs, str(description.get("fitted_to", ""))
+    return Model(LFR(cell), scaler, *about, K, reach)
+
+
+def _under(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Take the tensors whose names begin so, without that beginning."""
+    names = [name for name in weights if name.startswith(prefix)]
+    return {name.removeprefix(prefix): weights.pop(name) for name in names}
 
 
 def _flat(reach: DataReach) -> dict[str, Array]:
@@ -925,22 +938,6 @@ def _flat(reach: DataReach) -> dict[str, Array]:
 
 def _inputs(record: Record) -> Array:
     return record.u
-
-
-def _hold_again(cell: LFRCell, masks: Mapping[str, Tensor], description: Mapping[str, Any]) -> None:
-    """Hold the entries of a checkpoint; those of before name some of them in the description."""
-    named = description.get("structure", "free")
-    if named not in held.STRUCTURES:
-        raise InputError(f"structure is {named!r}")
-    for given in (
-        {name: (mask, cell.get_parameter(name).detach()) for name, mask in masks.items()},
-        held.structure(cell, named),
-        held.no_feedthrough(
-            cell, z=description.get("z_feedthrough", True), y=description.get("feedthrough", True)
-        ),
-        held.integrators(cell),
-    ):
-        cell.hold(given)
 
 
 def check_channels(model: Model, record: Record) -> None:

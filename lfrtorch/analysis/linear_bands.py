@@ -13,6 +13,7 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import reals
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.resolvent import known
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,7 @@ def pole_bands(model: LinearModel) -> tuple[PoleBand, ...]:
         1
     """
     nx = model.nx
-    covariance = model.known_covariance[: nx * nx, : nx * nx]
+    covariance = known(model.covariance)[: nx * nx, : nx * nx]
     poles, right = np.linalg.eig(model.A)
     left = np.linalg.pinv(right)
     found = []

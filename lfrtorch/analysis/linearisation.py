@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
@@ -17,13 +15,11 @@ from lfrtorch._support.types import Array, Complex
 from lfrtorch.analysis.trim import Trim
 from lfrtorch.engine.held import integrating_states
 from lfrtorch.engine.operating_point import (
-    StateSpace,
     double,
     equilibrium,
     linearised_at,
     resting_input,
 )
-from lfrtorch.engine.operating_point import linear_part as linear_part_of
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
@@ -84,16 +80,14 @@ def linearise(
         found = torch.as_tensor(vector("x", x, cell.nx, "the model has {} states"))
     with torch.no_grad():
         y0 = scaler.restore_y(cell(v, found)[0].numpy())
-    local = _linear_model(model, linearised_at(cell, v, found), np.array(u0), y0)
-    K = None if model.K is None else model.K.double().cpu().numpy() / scaler.y_scale
-    outside = model.outside(np.asarray(u0), found.numpy())
-    return replace(local, K=K, x_offset=found.numpy(), outside=outside)
+    outside, at = model.outside(np.asarray(u0), found.numpy()), linearised_at(cell, v, found)
+    about = {"u_offset": np.array(u0), "y_offset": y0, "x_offset": found.numpy()}
+    return LinearModel.of(model, at, outside=outside, **about)
 
 
 def linear_part(model: Model) -> LinearModel:
     """A, Bu, Cy and Dyu of a model, in physical units: the model without its static map."""
-    system = linear_part_of(double(model.lfr.cell))
-    return _linear_model(model, system, model.scaler.u_offset, model.scaler.y_offset)
+    return LinearModel.of(model, K=None)
 
 
 def poles_at_rest(model: Model) -> Complex:
@@ -103,12 +97,6 @@ def poles_at_rest(model: Model) -> Complex:
     x = equilibrium(cell, u)
     at = linearised_at(cell, u, u.new_zeros(cell.nx) if x is None else x)
     return np.asarray(np.linalg.eigvals(at.A), complex)
-
-
-def _linear_model(model: Model, system: StateSpace, u0: Array, y0: Array) -> LinearModel:
-    return LinearModel(
-        *system.physical(model.scaler), model.fs, u0, y0, model.inputs, model.outputs
-    )
 
 
 def vector(name: str, given: ArrayLike, size: int, expected: str) -> Array:

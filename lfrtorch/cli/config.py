@@ -14,7 +14,6 @@ from omegaconf import DictConfig, OmegaConf
 from torch.nn import Module
 
 import lfrtorch
-from lfrtorch._support import checkpoint
 from lfrtorch._support.checks import integer, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines
@@ -74,13 +73,12 @@ def users_own(node: Any, **options: Any) -> Any:
 def opened(cfg: DictConfig) -> lfrtorch.Model:
     """The model of ``init_from`` as it was saved; sizes that it replaces are named."""
     own = own_map(cfg, cfg.nz, cfg.nw) if cfg.static.kind == "own" else None
-    description, _ = checkpoint.read(cfg.init_from)
-    if "linear" in description:
+    model = lfrtorch.load(cfg.init_from, static=own)
+    if not model.lfr.cell.nw:
         raise InputError(
             f"init_from is '{cfg.init_from}', a linear model: give the folder of a run of "
             "lfrtorch fit, or leave it out, as a fit starts from a linear model of its own."
         )
-    model = lfrtorch.load(cfg.init_from, static=own)
     for name, size in model.sizes.items():
         if cfg[name] not in (size, None):
             print(

@@ -14,7 +14,7 @@ import numpy as np
 from omegaconf import DictConfig, ListConfig
 
 import lfrtorch
-from lfrtorch._support import checkpoint, tables
+from lfrtorch._support import tables
 from lfrtorch._support.atomic import refuse_existing
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
@@ -116,9 +116,6 @@ def chosen(cfg: DictConfig) -> str:
 
 def opened(folder: str) -> lfrtorch.Model:
     """The model of a checkpoint, a linear one as an NL-LFR without static nonlinearity."""
-    description, _ = checkpoint.read(folder)
-    if "linear" in description:
-        return lfrtorch.LinearModel.load(folder).to_model()
     return lfrtorch.load(folder)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,22 @@ def in_columns(facts: Sequence[tuple[str, str | None]]) -> list[str]:
     """Lines of names with their texts; names without a text are left out."""
     width = max(len(name) for name, _ in facts)
     return [f"{name:<{width}}  {text}" for name, text in facts if text]
+
+
+def linear_text(model: Any) -> str:
+    """A linear model: what it was found from, its poles and its gains."""
+    fit = model.fit
+    facts = [
+        ("sampled at", f"{model.fs:g} Hz"),
+        ("inputs", levels(model.inputs, model.u_offset)),
+        ("outputs", levels(model.outputs, model.y_offset)),
+        ("order", f"{model.nx}"),
+        ("outside of the data", model.outside),
+        ("fit", fit and f"{fit.criterion} error {number(fit.rmse)} (normalised), {fit.reason}"),
+    ]
+    system = {"": StateSpace(model.A, model.B, model.C, model.D)}
+    lines = system_lines(system, model.fs, model.inputs, model.outputs)
+    return "\n".join(["Linear model", *in_columns(facts), *lines])
 
 
 def system_lines(

@@ -7,7 +7,8 @@ from typing import Any
 
 from lfrtorch._support.optional import imported
 from lfrtorch.export.equations import Equations, check_name, equations
-from lfrtorch.linear.model import LinearModel, control_labels
+from lfrtorch.linear.control import control_labels
+from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.formula_code import PYTHON, statements
 from lfrtorch.maps.operations import Formula
 from lfrtorch.model import Model

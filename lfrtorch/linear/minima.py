@@ -14,7 +14,7 @@ import numpy as np
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.linear.model import balancing
+from lfrtorch.linear.balancing import balancing
 from lfrtorch.linear.refinement import Matrices, Refined, Search
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Complex128, Float
 
 from lfrtorch._support.types import Array, Complex
-from lfrtorch.linear.model import LinearModel, balancing
+from lfrtorch.linear.balancing import balancing
+from lfrtorch.linear.model import LinearModel
 from lfrtorch.records import Channel, Record, as_records, rms_scale, without_coordinates
 
 MINOR = 1 / 3

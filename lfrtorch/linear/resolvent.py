@@ -11,7 +11,10 @@ from __future__ import annotations
 import numpy as np
 import scipy
 from jaxtyping import Complex128, Float, Integer
+from numpy.typing import ArrayLike
 
+from lfrtorch._support.checks import reals
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex, Integers
 
 
@@ -96,3 +99,34 @@ def _places(nx: int, nu: int, ny: int) -> tuple[Integers, Integers]:
     blocks = [np.meshgrid(r, c, indexing="ij") for r, c in ((x, x), (x, u), (y, x), (y, u))]
     rows, columns = zip(*blocks, strict=True)
     return np.concatenate([r.ravel() for r in rows]), np.concatenate([c.ravel() for c in columns])
+
+
+def response_covariance(
+    A: Float[Array, "nx nx"],
+    B: Float[Array, "nx nu"],
+    C: Float[Array, "ny nx"],
+    covariance: Float[Array, "P P"] | None,
+    z: Complex128[Complex, " F"],
+) -> Float[Array, "F ny nu 2 2"]:
+    """Covariance of the real and imaginary part of G from that of the matrices' entries."""
+    J = gain_jacobian(A, B, C, z)
+    parts = np.stack([J.real, J.imag], axis=-2)
+    return np.einsum("...ip,pq,...jq->...ij", parts, known(covariance), parts, optimize=True)
+
+
+def known(covariance: Array | None) -> Array:
+    """The covariance of a linear model; a ValueError if there is none."""
+    if covariance is None:
+        raise InputError(
+            "the covariance of this model is not known: take one of estimate_bla, or of "
+            "lfrtorch.analysis.uncertainty(model, records).linearise()."
+        )
+    return covariance
+
+
+def unit_circle(frequencies: ArrayLike, fs: float) -> Complex128[Complex, " F"]:
+    """The points z of frequencies in Hz."""
+    f = np.atleast_1d(reals("frequencies", frequencies))
+    if f.ndim != 1:
+        raise InputError(f"the frequencies have shape {f.shape}; give one dimension, in Hz.")
+    return np.exp(2j * np.pi * f / fs)

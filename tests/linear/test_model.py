@@ -19,7 +19,8 @@ from reference import System, normal, random_cell, random_model, random_system
 import lfrtorch
 from lfrtorch._support.types import Array
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.linear.model import LinearFit, LinearModel, balancing
+from lfrtorch.linear.balancing import balancing
+from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.resolvent import frequency_response
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, Scaler
@@ -129,7 +130,7 @@ def test_prediction_is_its_recursion_on_any_data(observed: LinearModel):
 
 def test_prediction_needs_a_gain(model: LinearModel):
     u = some_input()
-    with pytest.raises(ValueError, match="no innovation gain K: estimate it with refine='pred"):
+    with pytest.raises(ValueError, match="no innovation gain K"):
         model.predict(Record(u, u, FS))
 
 
@@ -487,26 +488,27 @@ def test_folder_of_a_nonlinear_model(tmp_path: Path):
         LinearModel.load(folder)
 
 
-def test_nonlinear_models_are_not_in_the_folder_of_a_linear_one(model: LinearModel, tmp_path: Path):
-    folder = model.save(tmp_path / "bla")
-    message = f"'{folder}' holds a linear model, as estimate_bla makes it; read it with"
-    with pytest.raises(ValueError, match=re.escape(message) + ".*LinearModel.load"):
-        lfrtorch.load(folder)
+def test_a_linear_model_is_a_model(model: LinearModel, tmp_path: Path):
+    loaded = lfrtorch.load(model.save(tmp_path / "bla"))
+    u = np.random.default_rng(0).standard_normal((50, len(model.inputs)))
+    assert np.array_equal(loaded.simulate(u), model.simulate(u))
+    assert loaded.sizes["nz"] == 0
+    same(model, LinearModel.of(loaded))
 
 
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda d: d["linear"].pop("fs"),
+        lambda d: d.pop("fs"),
         lambda d: d["linear"].pop("fit"),
         lambda d: d["linear"]["fit"].pop("notes"),
         lambda d: d["linear"]["fit"].update(other=1),
-        lambda d: d["linear"].update(fs="fast"),
+        lambda d: d.update(fs="fast"),
         lambda d: d.pop("inputs"),
         lambda d: d["inputs"].pop(),
         lambda d: d["outputs"].append({"name": "y3", "unit": ""}),
         lambda d: d["outputs"][0].update(colour="red"),
-        lambda d: d.update(linear=None),
+        lambda d: d.update(linear=3),
     ],
 )
 def test_damaged_description(observed: LinearModel, tmp_path: Path, damage):
@@ -523,7 +525,7 @@ def test_weights_of_another_model(model: LinearModel, tmp_path: Path):
     for system in (random_system(3, 1, 2), random_system(3, 2, 1)):
         other = of_system(system).save(tmp_path / "other")
         (folder / "weights.safetensors").write_bytes((other / "weights.safetensors").read_bytes())
-        with pytest.raises(ValueError, match=r"is damaged: .* is \(.*\), not \(.*\)"):
+        with pytest.raises(ValueError, match="is damaged: its description and weights do not fit"):
             LinearModel.load(folder)
     other = random_model(random_cell()).save(tmp_path / "model")
     (folder / "weights.safetensors").write_bytes((other / "weights.safetensors").read_bytes())

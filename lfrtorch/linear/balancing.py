@@ -1,0 +1,77 @@
+"""Coordinates of a linear model: balanced ones, and any others."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from lfrtorch._support.types import Array
+
+
+def in_coordinates(
+    model: Any, T: Float[Array, "nx nx"], inverse: Array | None = None
+) -> dict[str, Array | None]:
+    """Arrays of a linear model in the coordinates T x, by name."""
+    back = np.asarray(np.linalg.inv(T) if inverse is None else inverse, dtype=np.float64)
+    covariance, P = model.covariance, model.state_covariance
+    if covariance is not None:
+        nu, ny = np.eye(len(model.inputs)), np.eye(len(model.outputs))
+        blocks = np.kron(T, back.T), np.kron(T, nu), np.kron(ny, back.T), np.kron(ny, nu)
+        change = scipy.linalg.block_diag(*blocks)
+        covariance = change @ covariance @ change.T
+    return dict(
+        A=T @ model.A @ back,
+        B=T @ model.B,
+        C=model.C @ back,
+        K=None if model.K is None else T @ model.K,
+        covariance=covariance,
+        state_covariance=None if P is None else T @ P @ T.T,
+        x_offset=None if model.x_offset is None else T @ model.x_offset,
+    )
+
+
+def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
+    """Return T and T⁻¹ to balanced coordinates, by the square-root method (Laub et al. 1987).
+
+    An unstable system has none, and keeps its own.
+    """
+    controllable, observable = _gramian(A, B @ B.T), _gramian(A.T, C.T @ C)
+    if controllable is None or observable is None:
+        return np.eye(len(A)), np.eye(len(A))
+    Lp, Lq = _square_root(controllable), _square_root(observable)
+    U, s, Vh = np.linalg.svd(Lq.T @ Lp)
+    if not s.any():  # no input reaches an output: all coordinates are balanced
+        return np.eye(len(A)), np.eye(len(A))
+    # A state that is almost uncontrollable or unobservable would be scaled by its rounding error.
+    root = np.sqrt(np.maximum(s, s[0] * np.finfo(float).eps))
+    return (U / root).T @ Lq.T, Lp @ (Vh.T / root)
+
+
+_DOUBLINGS = 60
+"""Poles nearer to the unit circle than rounding have not ended then."""
+
+
+def _gramian(A: Array, Q: Array) -> Array | None:
+    """P = A P Aᵀ + Q by Smith's doubling.
+
+    scipy's solver forms I - A ⊗ A, which is singular to rounding if two poles are close to the unit
+    circle; the sum of A^k Q A^kᵀ stays positive semidefinite there. None if rounding puts a pole on
+    or beyond the circle.
+    """
+    P, eps = Q, np.finfo(float).eps
+    for _ in range(_DOUBLINGS):
+        if np.abs(A).max() <= eps:
+            return P
+        if np.abs(A).max() >= 1.0 / eps:
+            break
+        P = P + A @ P @ A.T
+        A = A @ A
+    return None
+
+
+def _square_root(gramian: Array) -> Array:
+    values, vectors = np.linalg.eigh((gramian + gramian.T) / 2)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
