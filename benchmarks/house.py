@@ -390,11 +390,8 @@ def hops(job: str) -> Callable[[Path, Callable[[Row], None]], None]:
                 stack.append(frame.f_code.co_filename)
                 frame = frame.f_back
             stack = [name for name in stack if own(name)]
-            rooms = {Path(name).parent.name for name in stack}
-            if (
-                not {"fitting", "least_squares"} <= rooms
-                or f"{os.sep}engine{os.sep}" not in stack[0]
-            ):
+            fits = any(name.endswith(f"fitting{os.sep}trainer.py") for name in stack)
+            if not fits or f"{os.sep}engine{os.sep}" not in stack[0]:
                 return
             sys.setprofile(None)
             depth = sum(a != b for a, b in pairwise(stack))

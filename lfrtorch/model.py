@@ -667,6 +667,15 @@ class Model:
             )
         return E
 
+    def to_model(self) -> Model:
+        """Itself, as a linear model gives its own.
+
+        Example:
+            >>> model.to_model() is model
+            True
+        """
+        return self
+
     def predictor(self) -> Model:
         """The model of the output one sample ahead; its inputs are u, then y.
 

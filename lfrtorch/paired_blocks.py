@@ -26,7 +26,8 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import ceil, inf
+from dataclasses import dataclass
+from math import ceil, inf, log, sqrt
 
 import numpy as np
 
@@ -40,39 +41,84 @@ BLOCKS = 10
 """Least number of blocks of time, over all records."""
 
 
-def as_good(
-    squares: Sequence[Array] | Array, counts: Integers, *, errors: float = 1.0, most: float = 1.05
-) -> Booleans:
-    """Return which models do as well as the best.
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """What ranks: orders, sizes, starts, and an NL-LFR beside its linear model.
 
-    Their mean squares are within so many standard ``errors`` of the least and their rms errors at
-    most ``most`` times as large, or within ``MARGIN``.
+    Args:
+        squares: sums of squared errors of each model in each block of time; infinite if it
+            diverges.
+        counts: samples of each block.
+
+    Shape:
+        squares: (C, B), counts: (B,).
     """
-    means = np.asarray(squares).sum(axis=1)
-    near = standard_errors_above(squares, counts) <= errors
-    near &= means <= most**2 * means.min()
-    return near | (means <= (1.0 + MARGIN) ** 2 * means.min())
+
+    squares: Array
+    counts: Integers
+
+    @classmethod
+    def of(cls, errors: Sequence[Sequence[Array]]) -> Judge:
+        """That of models by their errors (T, ny) on each record."""
+        blocks = in_blocks([e[:, 0] for e in errors[0]])
+        counts = np.array([len(block) for block in blocks])
+        return cls(np.array([squares_in_blocks(each) for each in errors]), counts)
+
+    def ranked(self) -> list[int]:
+        """The models, the least error first; of equal ones the first is first."""
+        sums = self.squares.sum(axis=1)
+        return np.argsort(np.where(np.isnan(sums), inf, sums), kind="stable").tolist()
+
+    def as_good(self, *, errors: float = 1.0, most: float = 1.05) -> Booleans:
+        """Return which models do as well as the best.
+
+        Their mean squares are within so many standard ``errors`` of the least and their rms errors
+        at most ``most`` times as large, or within ``MARGIN``.
+        """
+        means = self.squares.sum(axis=1)
+        near = self.above() <= errors
+        near &= means <= most**2 * means.min()
+        return near | (means <= (1.0 + MARGIN) ** 2 * means.min())
+
+    def first_good(self) -> int:
+        """The first model that does as well as the best."""
+        return int(np.argmax(self.as_good()))
+
+    def above(self) -> Array:
+        """How far the mean squares of models are above the least, in its standard errors."""
+        best = int(np.argmin(self.squares.sum(axis=1)))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            difference, error = blocked_mean(self.squares - self.squares[best], self.counts)
+            above = np.where(difference == 0.0, 0.0, difference / error)
+        return np.where(np.isfinite(above), above, inf)
+
+    def ratio(self) -> tuple[float, float]:
+        """The second model's rms error over the first one's, and its standard error."""
+        base, squares = self.squares
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            ratio = sqrt(squares.sum() / base.sum()) if base.any() else 1.0
+            # d ratio = d (squares - ratio² base) / (2 ratio mean base).
+            level = base.sum() / self.counts.sum() or 1.0
+            _, spread = blocked_mean((squares - ratio**2 * base) / level, self.counts)
+        return ratio, float(spread) / (2.0 * ratio) if ratio > 0 else 0.0
+
+    def middle(self, most: float, least_error: float) -> tuple[float, float]:
+        """Mean log ratio of the second model's errors over the blocks, and its errors from 0.
+
+        A ratio beyond ``most`` counts as that: a block in which one runs away is one of many.
+        """
+        base, squares = self.squares
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            logs = 0.5 * np.log(squares / base)
+        logs = np.clip(np.nan_to_num(logs), -log(most), log(most))
+        error = max(float(logs.std(ddof=1)) / sqrt(len(logs)), least_error)
+        return float(logs.mean()), float(logs.mean()) / error
 
 
 def no_progress(errors: Sequence[float], last: int) -> bool:
     """Return whether none of the last few rms errors is below the earlier ones by ``MARGIN``."""
     earlier = errors[:-last]
     return bool(earlier) and min(errors[-last:]) > min(earlier) / (1.0 + MARGIN)
-
-
-def standard_errors_above(squares: Sequence[Array] | Array, counts: Integers) -> Array:
-    """Return how far the mean squares of models are above the least, in its standard errors.
-
-    Args:
-        squares: sums of squared errors in each block of time (C, B); infinite if one diverges.
-        counts: samples of each block (B,).
-    """
-    sums = np.asarray(squares)
-    best = int(np.argmin(sums.sum(axis=1)))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        difference, error = blocked_mean(sums - sums[best], counts)
-        above = np.where(difference == 0.0, 0.0, difference / error)
-    return np.where(np.isfinite(above), above, inf)
 
 
 def blocked_mean(sums: Array, counts: Integers) -> tuple[Array, Array]:

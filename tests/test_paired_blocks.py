@@ -10,11 +10,10 @@ from scipy.signal import lfilter
 
 from lfrtorch.paired_blocks import (
     BLOCKS,
-    as_good,
+    Judge,
     blocked_mean,
     in_blocks,
     squares_in_blocks,
-    standard_errors_above,
 )
 
 pytestmark = pytest.mark.numeric
@@ -46,8 +45,7 @@ def test_standard_error_is_right_for_errors_that_are_correlated():
 def test_of_two_equal_models_the_smaller_is_taken_in_83_of_100_cases():
     rng = np.random.default_rng(1)
     above = [
-        standard_errors_above(rng.chisquare(50, (2, BLOCKS)), np.full(BLOCKS, 50))[0]
-        for _ in range(2000)
+        Judge(rng.chisquare(50, (2, BLOCKS)), np.full(BLOCKS, 50)).above()[0] for _ in range(2000)
     ]
     # (1 + P(|t| < 1)) / 2 of Student's t with 9 degrees of freedom; 4 standard deviations.
     assert np.mean(np.array(above) <= 1.0) == pytest.approx(0.828, abs=0.034)
@@ -58,7 +56,7 @@ def test_noise_that_models_share_does_not_hide_which_is_better():
     T, excess = 2600, 0.118
     noise, own = rng.standard_normal((2, T))
     squares, counts = sums([noise**2, (noise + excess * own) ** 2])
-    above = standard_errors_above(squares, counts)
+    above = Judge(squares, counts).above()
     assert above[0] == 0.0
     assert above[1] > 2.0
     mean, error = blocked_mean(squares, counts)
@@ -76,9 +74,7 @@ def test_blocks_cover_every_record():
 
 
 def test_a_model_that_diverges_is_infinitely_far_above_the_best():
-    above = standard_errors_above(
-        np.array([[np.inf] * 10, [2.0] * 10, [2.0] * 10]), np.ones(10, int)
-    )
+    above = Judge(np.array([[np.inf] * 10, [2.0] * 10, [2.0] * 10]), np.ones(10, int)).above()
     assert above.tolist() == [np.inf, 0.0, 0.0]
 
 
@@ -90,14 +86,14 @@ def test_errors_that_are_not_finite_are_infinite_and_no_model_is_as_good():
     lost = squares_in_blocks(errors)
     assert np.isinf(lost).all()
     counts = np.array([len(block) for block in in_blocks([e[:, 0] for e in errors])])
-    assert as_good([lost, sums], counts).tolist() == [False, True]
+    assert Judge(np.array([lost, sums]), counts).as_good().tolist() == [False, True]
 
 
 @pytest.mark.parametrize("scale", [2.0**-660, 2.0**660])
 def test_units_do_not_change_which_model_is_as_good(scale: float):
     squares, counts = np.random.default_rng(0).uniform(1.0, 1.1, (5, 12)), np.full(12, 50)
-    expected = standard_errors_above(squares, counts)
-    assert np.array_equal(standard_errors_above(squares * scale, counts), expected)
+    expected = Judge(squares, counts).above()
+    assert np.array_equal(Judge(squares * scale, counts).above(), expected)
 
 
 @given(
@@ -124,7 +120,7 @@ def test_the_best_of_any_models_is_as_good_and_nothing_is_nan(
     assert counts.sum() == sum(lengths)
     assert counts.min() >= 1
     squares = np.array([squares_in_blocks(each) for each in errors])
-    above, good = standard_errors_above(squares, counts), as_good(squares, counts)
+    above, good = Judge(squares, counts).above(), Judge(squares, counts).as_good()
     assert (above >= 0.0).all()  # False for NaN
     if np.isfinite(squares).all(axis=1).any():
         best = np.argmin(squares.sum(axis=1))

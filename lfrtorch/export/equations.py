@@ -165,7 +165,7 @@ def equations(
     model: Model | LinearModel, own: Callable[[Module, int], Written | None] = lambda *_: None
 ) -> Equations:
     """The equations of a model; ``own`` writes a static map of nz inputs that has none itself."""
-    model = model.to_model() if isinstance(model, LinearModel) else model
+    model = model.to_model()
     cell, s = double(model.lfr.cell), model.scaler
     written = cell.map.written
     if written is None and cell.static is not None:
@@ -228,7 +228,7 @@ def observer_equations(
     """Gain or noise of an observer; None for no observer."""
     if observer is False:
         return None
-    model = model.to_model() if isinstance(model, LinearModel) else model
+    model = model.to_model()
     if isinstance(observer, NoiseCovariance):
         cell = model.lfr.cell
         return KalmanNoise(observer.root(cell.nx, cell.ny), data_root(cell))

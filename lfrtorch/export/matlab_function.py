@@ -60,7 +60,7 @@ def matlab_function(
         (100.0, (1, 1))
     """
     check_name(name)
-    model = model.to_model() if isinstance(model, LinearModel) else model
+    model = model.to_model()
     e = equations(model)
     if e.map.nw and not e.weights:
         raise InputError(

@@ -205,7 +205,7 @@ def write(
                 "a disturbance is estimated by a Kalman filter: give observer=noise, too "
                 "(observer=true Q=... R=... on the command line)."
             )
-        model = model.to_model() if isinstance(model, LinearModel) else model
+        model = model.to_model()
         model, observer = model.with_disturbance(disturbance, observer)
     target, given = TARGETS[to], {}
     endings = target.endings + (target.reach if knows_reach(model) else ())

@@ -54,12 +54,13 @@ from lfrtorch.least_squares.guarantee import Name
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
+from lfrtorch.least_squares.search import Search
 from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.least_squares.term import Seen
 from lfrtorch.linear.bla import refined_near
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
-from lfrtorch.paired_blocks import as_good, standard_errors_above
+from lfrtorch.paired_blocks import Judge
 from lfrtorch.records import Record, Scaler, as_records
 
 Sizes = dict[str, int]
@@ -148,7 +149,7 @@ class Choice:
     def entries(self) -> list[dict[str, Any]]:
         """Numbers of each, by name."""
         squares = np.array([c.squares.ravel() for c in self.candidates])
-        above = standard_errors_above(squares, self.counts.ravel())
+        above = Judge(squares, self.counts.ravel()).above()
         return [
             {
                 **c.sizes,
@@ -360,8 +361,8 @@ def _chosen(tried: Sequence[Candidate], of: Sequence[int], counts: Integers) -> 
     for i, candidate in enumerate(tried):
         sizes.setdefault(tuple(candidate.sizes.values()), []).append(i)
     # Of a size the largest ridge was tried first. Where all diverge, all are as good.
-    best = [own[int(np.argmax(as_good(squares[own], blocks)))] for own in sizes.values()]
-    good = as_good(squares[best], blocks, errors=_ERRORS, most=_MOST)
+    best = [own[Judge(squares[own], blocks).first_good()] for own in sizes.values()]
+    good = Judge(squares[best], blocks).as_good(errors=_ERRORS, most=_MOST)
     near = [tried[i] for i, enough in zip(best, good, strict=True) if enough]
     return min(near, key=lambda c: c.parameters_net)
 
@@ -441,8 +442,8 @@ class _Study:
                 "no linear model of these records is stable without a quarter of them; give longer "
                 "records, or set the sizes."
             )
-        good = as_good([each.squares.ravel() for each in found], self.counts.ravel())
-        return found[int(np.argmax(good))]
+        squares = np.array([each.squares.ravel() for each in found])
+        return found[Judge(squares, self.counts.ravel()).first_good()]
 
     @property
     def slowest(self) -> float:
@@ -532,12 +533,10 @@ class _Study:
 
         for ridge, iterations in self._ridges:
             problem.weigh(ridge)
-            search = LevenbergMarquardt(max_iter=iterations, tolerance=1e-3, patience=2)
-            state = search.init(problem, theta)
-            while not state.reason:
-                if self._stop is not None and self._stop():
-                    raise StoppedError("stopped while sizes were chosen")
-                state = search.step(problem, state)
+            optimiser = LevenbergMarquardt(max_iter=iterations, tolerance=1e-3, patience=2)
+            search = Search(problem, optimiser)
+            search.begin(theta)
+            state = search.advance(iterations, check=self._check).state
             theta = state.theta
             problem.write(theta)
             stable = largest_stable_amplitude(model, fold.train) >= max(LOUDER)
@@ -546,6 +545,11 @@ class _Study:
             both = fold.left_out(through), fold.begun_again(through, simulated)
             cost = state.cost if stable and not remembers else np.inf
             yield _Step(cost, *both, remembers)
+
+    def _check(self) -> None:
+        """End if that is asked for."""
+        if self._stop is not None and self._stop():
+            raise StoppedError("stopped while sizes were chosen")
 
     def _simulated(self, job: tuple[LinearModel, Fold]) -> tuple[Array, Array]:
         """Return the output where it was left out: simulated through, and begun there."""

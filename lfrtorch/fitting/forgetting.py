@@ -120,8 +120,7 @@ def forgets(
     apart, ends, paths = _apart(model, seen, scale)
     slow = 0.0
     if linear is not None and not apart <= LIMIT:
-        as_model = linear.to_model() if isinstance(linear, LinearModel) else linear
-        slow, *_ = _apart(as_model, seen, scale)
+        slow, *_ = _apart(linear.to_model(), seen, scale)
     found = Memory(apart, slow)
     if found.fades or not np.isfinite(apart):
         return found

@@ -28,6 +28,7 @@ from math import ceil
 from threading import Event
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -69,6 +70,7 @@ from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.least_squares.shared_problem import same_weights
 from lfrtorch.model import Model
+from lfrtorch.paired_blocks import Judge
 from lfrtorch.records import Record, as_records, common_unit
 from lfrtorch.score_window import with_window
 
@@ -390,8 +392,14 @@ class _Judge:
 
     def ranked(self, fits: Sequence[Fit]) -> list[Fit]:
         """Sort the fits that have begun, the best first, and those that are refused last."""
-        begun = (fit for fit in fits if fit.history)
-        return sorted(begun, key=lambda fit: (id(fit) in self._refused, self._score(fit)))
+        begun = [fit for fit in fits if fit.history]
+        begun.sort(key=lambda fit: id(fit) in self._refused)
+        kept = sum(id(fit) not in self._refused for fit in begun)
+        return [fit for some in (begun[:kept], begun[kept:]) for fit in self._in_order(some)]
+
+    def _in_order(self, fits: Sequence[Fit]) -> list[Fit]:
+        squares = np.array([[self._score(fit)] for fit in fits]).reshape(-1, 1)
+        return [fits[i] for i in Judge(squares, np.ones(1, int)).ranked()]
 
     def refuse_what_remembers(
         self, fits: Sequence[Fit], train: Sequence[Record], start: Model

@@ -25,6 +25,7 @@ from lfrtorch.least_squares.guarantee import Name
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, Point
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
+from lfrtorch.least_squares.search import Search
 from lfrtorch.least_squares.shared_problem import problem_of
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
@@ -271,7 +272,7 @@ class Fit:
                 self.begin(monitors)
             while self.short_of(until):
                 clock = time.perf_counter()
-                after = self.trainer.step(self.problem, self.state)
+                after = Search(self.problem, self.trainer, self.state).step()
                 self.take(after, time.perf_counter() - clock, monitors)
         except KeyboardInterrupt:
             if not self.history:
@@ -330,7 +331,7 @@ class Fit:
     def _begun(self) -> FitState:
         """State at the start."""
         clock = time.perf_counter()
-        start = self.trainer.init(self.problem, self.problem.theta, self._start)
+        start = Search(self.problem, self.trainer).begin(self.problem.theta, self._start)
         self._start = None  # its trajectories are the state's now
         at = FitState(start, (), start.theta, ())
         return self._entered(at, start, time.perf_counter() - clock)

@@ -14,8 +14,9 @@ import numpy as np
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.least_squares.search import Search
 from lfrtorch.linear.balancing import balancing
-from lfrtorch.linear.refinement import Matrices, Refined, Search
+from lfrtorch.linear.refinement import Matrices, Refined
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
 from lfrtorch.linear.subspace import SubspaceEstimate

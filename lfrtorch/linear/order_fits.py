@@ -19,11 +19,12 @@ import numpy as np
 
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
+from lfrtorch.least_squares.search import Search
 from lfrtorch.linear.bla import Settings, default_criterion, physical, pose
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.minima import ALIKE, distinct, no_start, search_from, transformation
 from lfrtorch.linear.model import LinearFit, LinearModel
-from lfrtorch.linear.refinement import Matrices, Refined, Search
+from lfrtorch.linear.refinement import Matrices, Refined
 from lfrtorch.linear.requirements import check_spectral_data
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit

@@ -35,10 +35,8 @@ from lfrtorch.metrics import rms
 from lfrtorch.paired_blocks import (
     BLOCKS,
     MARGIN,
-    as_good,
-    in_blocks,
+    Judge,
     no_progress,
-    squares_in_blocks,
 )
 from lfrtorch.records import Record, Scaler, as_records, measured_signals, without_coordinates
 from lfrtorch.score_window import with_window
@@ -258,8 +256,7 @@ def _first(tried: Sequence[_Tried]) -> int:
     errors = [each.errors for each in tried]
     if sum(map(len, errors[0])) < BLOCKS:  # or none
         return int(np.argmin(_scores(tried)))
-    counts = np.array([len(block) for block in in_blocks([e[:, 0] for e in errors[0]])])
-    return int(np.argmax(as_good([squares_in_blocks(each) for each in errors], counts)))
+    return Judge.of(errors).first_good()
 
 
 def _errors(records: Sequence[Record], scale: Array, model: LinearModel) -> list[Array]:

@@ -23,10 +23,11 @@ from lfrtorch._support.types import Array, Booleans, Complex
 from lfrtorch.least_squares.gauge import Reduction, reduction
 from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, Point
 from lfrtorch.least_squares.linear_systems import SVDSystem
+from lfrtorch.least_squares.search import Search
 from lfrtorch.linear.modal_jacobian import ModalJacobian, Modes, stacked, with_best_inputs
 from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.pole_limits import PART, Excess, PoleLimits
-from lfrtorch.linear.refinement import TOLERANCE, TRUNCATION, Matrices, Refined, Search
+from lfrtorch.linear.refinement import TOLERANCE, TRUNCATION, Matrices, Refined, refining
 from lfrtorch.linear.resolvent import (
     frequency_response,
     response_jacobian,
@@ -135,7 +136,7 @@ class ResponseFit:
             limits=None if self.starts else PoleLimits(self.data.z),
         )
         theta = torch.as_tensor(np.concatenate([m.ravel() for m in matrices]))
-        return Search(problem, theta, 1e-7 if self.many(len(matrices[0])) else TOLERANCE)
+        return refining(problem, theta, 1e-7 if self.many(len(matrices[0])) else TOLERANCE)
 
     def _free_inputs(self, nx: int) -> Booleans:
         """Mask of the entries of B (nx, nu) that are parameters."""

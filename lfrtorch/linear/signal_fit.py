@@ -25,10 +25,11 @@ from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.least_squares.problem import Problem
+from lfrtorch.least_squares.search import Search
 from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.least_squares.term import Seen, Term, TermRows
 from lfrtorch.linear.model import linear_cell
-from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
+from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, refining
 from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_signals
 from lfrtorch.model import simulate_record
 from lfrtorch.records import PAST_OUTPUTS, NormalisedRecord
@@ -108,7 +109,7 @@ class SignalFit:
             gains += [self._observer(matrices, part * variances) for part in OBSERVERS]
         problems = [self._problem(matrices, K) for K in gains]
         problem = min(problems, key=lambda p: p.evaluate(p.theta).cost)
-        return Search(problem, problem.theta)
+        return refining(problem, problem.theta)
 
     def unstable(self, found: Refined, max_iter: int) -> Refined:
         """Return an unstable system that predicts clearly better, or the found one.
@@ -118,7 +119,7 @@ class SignalFit:
         if found.K is None or np.abs(np.linalg.eigvals(found.A)).max() < 0.99:
             return found
         problem = self._problem(found.matrices, found.K, stable=False)
-        more = self.refined(Search(problem, problem.theta).advance(max_iter))
+        more = self.refined(refining(problem, problem.theta).advance(max_iter))
         gain = 2 * problem.size * math.log(found.rmse / max(more.rmse, 1e-300))
         clear = np.abs(np.linalg.eigvals(more.A)).max() >= 1.0 and gain > UNSTABLE
         return more if clear else found

@@ -31,7 +31,7 @@ from lfrtorch._support.tables import number, percent
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.metrics import nrmse, rms
-from lfrtorch.paired_blocks import BLOCKS, blocked_mean, in_blocks
+from lfrtorch.paired_blocks import BLOCKS, Judge, in_blocks
 from lfrtorch.reporting.evaluation import CROSS, Response, has_settled, training_deviations
 
 NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"
@@ -474,16 +474,13 @@ def _compared(
         np.concatenate([e / level for e, level in zip(each, levels, strict=True)])
         for each in ([e.squares for e in errors], [e.linear for e in errors])
     )
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        ratio = math.sqrt(squares.sum() / linear.sum()) if linear.any() else 1.0
-        # The linear model's mean square is 1: d ratio = d (squares - ratio² linear) / (2 ratio).
-        _, spread = blocked_mean(squares - ratio**2 * linear, counts)
-    ratio_std = float(spread) / (2.0 * ratio) if ratio > 0 else 0.0
+    beside = Judge(np.array([linear, squares]), counts)
+    ratio, ratio_std = beside.ratio()
     power = float(np.dot([e.power for e in errors], samples)) or math.nan
     first = errors[0].response
     several = f"{len(errors)} {_use(first)} records"
     cross = all(_is_cross(e.response) for e in errors)
-    middle, far = _in_the_middle(squares, linear)
+    middle, far = beside.middle(_MOST, _LEAST_ERROR)
     clear = stdtrit(len(counts) - 1, 1.0 - (1.0 - CONFIDENCE) / max(1, among))
     return _Compared(
         name=_name(first) if len(errors) == 1 else several,
@@ -503,18 +500,6 @@ def _compared(
 def _is_cross(response: Response) -> bool:
     """Tell whether it is of cross-validation, each stretch by other models."""
     return response.record.name.endswith(CROSS)
-
-
-def _in_the_middle(squares: Array, linear: Array) -> tuple[float, float]:
-    """Return the mean log ratio of the errors over the blocks, and its standard errors from 0.
-
-    A ratio beyond 3 or 1/3 counts as that: a block in which one model runs away is one of many.
-    """
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        logs = 0.5 * np.log(squares / linear)
-    logs = np.clip(np.nan_to_num(logs), -math.log(_MOST), math.log(_MOST))
-    error = max(float(logs.std(ddof=1)) / math.sqrt(len(logs)), _LEAST_ERROR)
-    return float(logs.mean()), float(logs.mean()) / error
 
 
 def _numbers(compared: _Compared) -> dict[str, Any]:
