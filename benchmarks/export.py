@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 import lfrtorch
+from lfrtorch.data.records import Channel
 from lfrtorch.export import casadi_function
-from lfrtorch.records import Channel
 
 NX, SEED, HORIZON, TARGET = 3, 0, 20, 0.5
 """Sizes of Bouc-Wen: 3 states, z of 2, w of 1, 15 neurons; the controller's problem."""

@@ -33,10 +33,10 @@ import torch
 
 import lfrtorch
 from lfrtorch._support.types import Array, Complex
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Scaler
 from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.linear.bla import Criterion
-from lfrtorch.metrics import rms
-from lfrtorch.records import Scaler
 
 GAIN = 0.6
 """Of the controller."""

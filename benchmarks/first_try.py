@@ -35,7 +35,7 @@ import lfrtorch
 from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.types import Array
-from lfrtorch.records import Start
+from lfrtorch.data.records import Start
 
 RESULTS = Path(__file__).with_name("first_try.json")
 

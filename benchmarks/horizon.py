@@ -30,7 +30,7 @@ import torch
 
 import lfrtorch
 from lfrtorch._support.types import Array
-from lfrtorch.metrics import rms
+from lfrtorch.data.metrics import rms
 
 STEP, NOISE = 0.1, 0.01
 TRAIN, VALIDATION, TEST = 3000, 600, 2000

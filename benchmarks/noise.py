@@ -45,11 +45,11 @@ import torch
 
 import lfrtorch
 from lfrtorch._support.types import Array
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Scaler, with_past_outputs
 from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.linear.bla import Criterion
-from lfrtorch.metrics import rms
-from lfrtorch.records import Scaler, with_past_outputs
 
 FORCE = 10.0
 """Deviation of the force that nobody measures over that of the sensor's noise, per sample, as

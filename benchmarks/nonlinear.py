@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 import lfrtorch
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
 from lfrtorch.datasets import parwh
 
 HERE = Path(__file__).resolve().parent

@@ -34,8 +34,8 @@ import torch
 
 import lfrtorch
 from lfrtorch._support.types import Array
-from lfrtorch.metrics import rms
-from lfrtorch.state_observer import StateObserver
+from lfrtorch.data.metrics import rms
+from lfrtorch.model.state_observer import StateObserver
 
 LEVELS = ((1e-3, 1e-2), (1e-2, 1e-2), (3e-2, 3e-2), (1e-1, 1e-1))
 """Deviations of the noise on the states, of unit rms, and on the output, relative to its rms."""

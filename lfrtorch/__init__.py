@@ -18,10 +18,10 @@ __version__ = _version("lfrtorch")
 
 _ROOMS = ("analysis", "datasets", "distributed", "export", "reporting")
 _NAMES = {
-    "dataset": "Dataset Published",
-    "excitation": "multisine",
+    "data.dataset": "Dataset Published",
+    "data.excitation": "multisine",
     "files.load": "load_records",
-    "records": "Channel Record Scaler",
+    "data.records": "Channel Record Scaler",
     "linear.bla": "estimate_bla",
     "linear.frf": "FRF estimate_frf",
     "linear.model": "LinearFit LinearModel",
@@ -31,9 +31,9 @@ _NAMES = {
     "maps.network": "Network",
     "maps.polynomial": "Polynomial",
     "maps.static_map": "StaticMap",
-    "extended_kalman_filter": "NoiseCovariance",
-    "known": "Known Parameter State",
-    "model": "Model load simulate_blocks",
+    "model.extended_kalman_filter": "NoiseCovariance",
+    "model.known": "Known Parameter State",
+    "model.model": "Model load simulate_blocks",
     "fitting.forgetting": "Memory forgets",
     "fitting.means": "mean_model",
     "fitting.multistart": "fit",
@@ -51,7 +51,7 @@ _NAMES = {
     "job": "identify",
     "reporting.preview": "Preview preview",
     "reporting.run": "Run",
-    "metrics": "nrmse rmse",
+    "data.metrics": "nrmse rmse",
     "_support.errors": "InputError LfrtorchError",
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}

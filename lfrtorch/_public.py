@@ -3,10 +3,10 @@
 from lfrtorch import analysis, datasets, distributed, export, reporting
 
 # data
-from lfrtorch.dataset import Dataset, Published
-from lfrtorch.excitation import multisine
+from lfrtorch.data.dataset import Dataset, Published
+from lfrtorch.data.excitation import multisine
 from lfrtorch.files.load import load_records
-from lfrtorch.records import Channel, Record, Scaler
+from lfrtorch.data.records import Channel, Record, Scaler
 
 # the linear model
 from lfrtorch.linear.bla import estimate_bla
@@ -20,9 +20,9 @@ from lfrtorch.engine.lfr import LFR
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.maps.static_map import StaticMap
-from lfrtorch.extended_kalman_filter import NoiseCovariance
-from lfrtorch.known import Known, Parameter, State
-from lfrtorch.model import Model, load, simulate_blocks
+from lfrtorch.model.extended_kalman_filter import NoiseCovariance
+from lfrtorch.model.known import Known, Parameter, State
+from lfrtorch.model.model import Model, load, simulate_blocks
 
 # fits
 from lfrtorch.fitting.forgetting import Memory, forgets
@@ -46,7 +46,7 @@ from lfrtorch.reporting.preview import Preview, preview
 from lfrtorch.reporting.run import Run
 
 # scores
-from lfrtorch.metrics import nrmse, rmse
+from lfrtorch.data.metrics import nrmse, rmse
 
 # errors
 from lfrtorch._support.errors import InputError, LfrtorchError

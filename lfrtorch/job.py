@@ -10,7 +10,8 @@ from typing import Any
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.frames import is_frame
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record
 from lfrtorch.distributed import Ranks, using
 from lfrtorch.files.split import cut
 from lfrtorch.fitting.observer import LineObserver, Observer
@@ -19,7 +20,6 @@ from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.stage import Job
 from lfrtorch.fitting.stages import STAGES
 from lfrtorch.fitting.trainer import Stop
-from lfrtorch.records import Record
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scored_run import scored_run
 

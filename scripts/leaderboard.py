@@ -16,9 +16,9 @@ from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
-from lfrtorch.metrics import rmse_by_output
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.data.metrics import rmse_by_output
+from lfrtorch.data.records import Record
+from lfrtorch.model.model import Model
 
 UNITS = {"V": ("mV", 1e3), "m": ("mm", 1e3)}
 """Units of the site by those of the records, if they differ."""

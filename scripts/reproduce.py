@@ -35,7 +35,7 @@ from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.tables import number
 from lfrtorch.cli.composition import composed
 from lfrtorch.cli.hydra_versions import instantiate
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.data.dataset import Dataset, Published
 from lfrtorch.datasets.official import LEGACY
 from lfrtorch.reporting import scores as report
 

@@ -5,9 +5,9 @@ import scipy.signal
 from reference import System, frf, periodic_response
 
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.records import Channel, Record
 
 FS, SEEDS = 50.0, 80
 

@@ -18,7 +18,7 @@ from lfrtorch.engine.cell import Matrices
 from lfrtorch.maps.activations import ACTIVATIONS
 from lfrtorch.maps.direct_sum import DirectSum
 from lfrtorch.maps.static_map import StaticMap
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 Step = Callable[[Array, Array], tuple[Array, Array]]
 """(x, u) -> (x_next, y), physical units."""

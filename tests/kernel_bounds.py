@@ -21,9 +21,9 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.engine.simulation_kernel import simulate_records
-from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.maps.activations import ACTIVATIONS
 from lfrtorch.maps.direct_sum import DirectSum
+from lfrtorch.model.extended_kalman_filter import NoiseCovariance
 
 MANY_STATES = 9
 """Rows of so many states go through other kernels."""

@@ -42,11 +42,15 @@ from cosmic_ray.operators.operator import Operator
 ROOT = Path(__file__).resolve().parents[1]
 
 TESTS: dict[str, str] = {
-    "records": "records stream",
+    "data/records": "data/records stream",
+    "data/paired_blocks": "data/paired_blocks",
+    "engine/held": "engine/held engine/integrators model/model fitting/held_pairs",
+    "engine/gauge_directions": "least_squares/gauge model/model",
+    "engine/innovation": "fitting/prediction fitting/held_pairs",
     "engine/feedback_recurrence": "engine/feedback_recurrence engine/sensitivity",
     "engine/linear_recurrence": "engine/linear_recurrence engine/newton engine/sensitivity",
     "engine/newton": "engine/newton",
-    "engine/simulation": "engine/simulation model engine/newton maps/maps",
+    "engine/simulation": "engine/simulation model/model engine/newton maps/maps",
     "engine/simulation_kernel": "engine/simulation maps/maps",
     "engine/initial_state": "engine/initial_state least_squares/problem",
     "engine/start_kernel": "engine/initial_state",
@@ -58,6 +62,9 @@ TESTS: dict[str, str] = {
     "maps/static_map": "maps/new_map maps/linearised",
     "engine/jacobian_kernel": "engine/sensitivity least_squares/problem",
     "engine/sensitivity": "engine/sensitivity least_squares/problem",
+    "least_squares/held_steps": "fitting/held_pairs least_squares/problem",
+    "least_squares/search": "linear/bla fitting/trainer",
+    "least_squares/shared_problem": "distributed",
     "least_squares/jacobian": "least_squares/problem least_squares/start_states memory",
     "least_squares/output_rows": "least_squares/problem least_squares/start_states memory",
     "least_squares/linear_systems": "least_squares/linear_systems least_squares/problem",

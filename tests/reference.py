@@ -15,6 +15,7 @@ from torch.func import functional_call, jacfwd
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch._support.types import Array, Complex
+from lfrtorch.data.records import Channel, Record, Scaler, Start
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.simulation import Trajectory
@@ -24,8 +25,7 @@ from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.model import Model
-from lfrtorch.records import Channel, Record, Scaler, Start
+from lfrtorch.model.model import Model
 
 Weights = dict[str, Tensor]
 

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.maps.activations import ACTIVATIONS
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

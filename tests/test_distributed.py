@@ -27,7 +27,8 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch._support.reasons import Reason
 from lfrtorch.cli.command import start as start_command
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record
 from lfrtorch.distributed import ProcessLostError, Ranks, connect, using
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.snapshots import Snapshots
@@ -36,8 +37,7 @@ from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
 from lfrtorch.least_squares.shared_problem import problem_of
-from lfrtorch.model import Model, load
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model, load
 from lfrtorch.reporting.monitor import Checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]

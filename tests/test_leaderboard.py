@@ -11,7 +11,7 @@ import pytest
 from reference import random_cell, random_model
 
 from lfrtorch import Record
-from lfrtorch.records import Channel
+from lfrtorch.data.records import Channel
 from scripts import leaderboard
 
 pytestmark = pytest.mark.numeric

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 import lfrtorch
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
 
 pytestmark = pytest.mark.numeric
 

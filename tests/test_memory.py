@@ -8,11 +8,11 @@ from reference import random_cell, random_model
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from lfrtorch.data.records import Record, Start
 from lfrtorch.engine import linearised, sensitivity
 from lfrtorch.least_squares import jacobian, output_rows
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
-from lfrtorch.records import Record, Start
 
 pytestmark = pytest.mark.numeric
 

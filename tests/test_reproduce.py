@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.data.dataset import Dataset, Published
+from lfrtorch.data.records import Record
 from lfrtorch.datasets import official
-from lfrtorch.records import Record
 from scripts import reproduce
 
 RECORD = Record(np.arange(9.0), np.arange(9.0))

@@ -13,7 +13,7 @@ from scipy.signal import cont2discrete
 
 from lfrtorch import LinearModel
 from lfrtorch.analysis import linearise
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

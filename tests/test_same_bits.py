@@ -15,14 +15,14 @@ from torch import Tensor
 
 import lfrtorch
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Record
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.engine.simulation import simulate
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

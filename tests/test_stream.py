@@ -16,9 +16,9 @@ from reference import random_cell, random_model
 import lfrtorch
 from lfrtorch import simulate_blocks
 from lfrtorch._support.types import Array
-from lfrtorch.metrics import BlockScores, nrmse, rmse
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.data.metrics import BlockScores, nrmse, rmse
+from lfrtorch.data.records import Record
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

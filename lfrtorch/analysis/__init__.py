@@ -15,8 +15,8 @@ from lfrtorch.analysis.lpv_form import LPV, lpv
 from lfrtorch.analysis.physical_parameters import PhysicalParameters, physical_parameters
 from lfrtorch.analysis.residual_analysis import Residuals, residuals
 from lfrtorch.analysis.trim import Trim, trim
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
+from lfrtorch.model.model import Model
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

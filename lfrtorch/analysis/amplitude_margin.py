@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
+from lfrtorch.model.model import Model
 
 LOUDER = (1.25, 1.5, 2.0)
 """Amplitudes at which a model is tried, relative to those of the data."""

@@ -23,14 +23,14 @@ from jaxtyping import Complex128, Float
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
-from lfrtorch.data_reach import whitening
+from lfrtorch.data.records import Record, as_records
 from lfrtorch.engine.cell import LFRCell, Matrices
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import static_slope
 from lfrtorch.engine.operating_point import double
 from lfrtorch.linear.resolvent import frequency_response
-from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.model.data_reach import whitening
+from lfrtorch.model.model import Model
 
 MOST_SAMPLES = 16_384
 """Most samples of a record, its last ones, for covariances and the response to w."""

@@ -37,15 +37,15 @@ from lfrtorch.analysis.output_residuals import LEVEL, ROUNDING, SLIGHT, OutputRe
 from lfrtorch.analysis.residual_analysis import SHORTEST, of_simulation
 from lfrtorch.analysis.static_slopes import infinite_slope
 from lfrtorch.analysis.training_reach import TrainingReach
-from lfrtorch.data_reach import FARTHEST
+from lfrtorch.data.records import Channel, Record, as_records, as_signal
 from lfrtorch.engine.held import held_parameters
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.operating_point import SINGULAR, equilibrium, linearised_at
 from lfrtorch.least_squares.gauge import reduction
 from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
-from lfrtorch.records import Channel, Record, as_records, as_signal
+from lfrtorch.model.data_reach import FARTHEST
+from lfrtorch.model.model import Model
 
 _TRUNCATION = 1e-8
 """Singular values of J, of columns of unit length, that count as zero relative to the largest."""

@@ -10,8 +10,8 @@ import scipy
 from jaxtyping import Float
 
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Record
 from lfrtorch.linear.spectra import Spectra, spectra_of_periods
-from lfrtorch.records import Record
 
 _SEGMENT, SHORTEST = 4096, 16
 """Most and fewest samples of a segment that a power spectral density is averaged over."""

@@ -15,12 +15,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lfrtorch.analysis.noise_model import NoiseModel
+from lfrtorch.data.records import Record
 from lfrtorch.engine.sensitivity import Linearisation, fixed_point
 from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator
 from lfrtorch.least_squares.record_groups import RecordGroup
 from lfrtorch.least_squares.simulation_errors import SimulationErrors
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 _SEEN = 1e-9
 """Directions of a start state that move the output by less than this, relative to others, stay."""

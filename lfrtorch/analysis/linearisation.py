@@ -13,6 +13,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import quantity
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.analysis.trim import Trim
+from lfrtorch.data.records import Channel
 from lfrtorch.engine.held import integrating_states
 from lfrtorch.engine.operating_point import (
     double,
@@ -21,8 +22,7 @@ from lfrtorch.engine.operating_point import (
     resting_input,
 )
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
-from lfrtorch.records import Channel
+from lfrtorch.model.model import Model
 
 
 @typed()

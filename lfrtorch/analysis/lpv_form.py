@@ -22,12 +22,12 @@ from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import vector
+from lfrtorch.data.records import Record, as_records
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import static_slope
 from lfrtorch.engine.operating_point import double, equilibrium
 from lfrtorch.maps.mean_slopes import Neurons
-from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.model.model import Model
 
 _ROUNDING = 1e-14
 """Error of f(z) - f(z0), relative to both, that is one of rounding."""

@@ -26,13 +26,13 @@ from lfrtorch._support.tables import percent
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.canonical_form import nearest_affine, whitening
 from lfrtorch.analysis.linearisation import linear_part, linearise
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Record, as_records
 from lfrtorch.engine.operating_point import double
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.linearised import linearise_map
 from lfrtorch.maps.static_map import StaticMap
-from lfrtorch.metrics import rms
-from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.model.model import Model
 
 _MOST_MAPS = 4
 """Outputs of the static map that are drawn."""

@@ -11,8 +11,8 @@ from lfrtorch._support.tables import number
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.analysis.correlation import Correlation
 from lfrtorch.analysis.densities import Densities
-from lfrtorch.metrics import rms
-from lfrtorch.records import Channel
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Channel
 
 LEVEL = 0.01
 """Significance level of the tests of independence."""

@@ -14,8 +14,8 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import Cell, in_lines, number, table
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.confidence_bands import NOT_AT_MINIMUM, uncertainty
-from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.data.records import Record, as_records
+from lfrtorch.model.model import Model
 
 _ALIKE = 0.95
 """Correlation from which a note names two parameters."""

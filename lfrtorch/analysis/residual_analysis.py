@@ -23,10 +23,10 @@ from lfrtorch.analysis.correlation import (
 )
 from lfrtorch.analysis.densities import Densities, noise_density, power_density
 from lfrtorch.analysis.output_residuals import ROUNDING, OutputResiduals
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Record, as_records
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.metrics import rms
-from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.model.model import Model
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

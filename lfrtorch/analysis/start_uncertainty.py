@@ -20,12 +20,12 @@ from jaxtyping import Float
 from scipy.linalg import matmul_toeplitz
 
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Record, of_one_unit
 from lfrtorch.engine.initial_state import state_moments
 from lfrtorch.engine.linear_recurrence import linear_recurrence
 from lfrtorch.engine.linearised import linearise
 from lfrtorch.engine.operating_point import double
-from lfrtorch.model import Model
-from lfrtorch.records import Record, of_one_unit
+from lfrtorch.model.model import Model
 
 LONGEST = 1 << 13
 """Samples at the beginning of a record whose free responses are computed."""

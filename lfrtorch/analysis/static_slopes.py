@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 
 from lfrtorch._support.tables import number
+from lfrtorch.data.records import Record
 from lfrtorch.maps.linearised import linearise_map
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lfrtorch._support.types import Array
-from lfrtorch.data_reach import FARTHEST, Cloud
+from lfrtorch.model.data_reach import FARTHEST, Cloud
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.operating_point import double, equilibrium, linearised_at, resting_near
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 _REST = 1e3  # weight of x = f(x, u) beside the outputs, before the state is put to rest exactly
 

@@ -19,7 +19,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines
 from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.cli.wording import as_words
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
 from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.survey.notes import notes_on

@@ -24,7 +24,7 @@ from lfrtorch.cli.config import loaded, require_data
 from lfrtorch.cli.run_folder import CONFIG, program, read_settings
 from lfrtorch.cli.simulate import chosen, opened
 from lfrtorch.files.load import EVERYTHING, listed_files
-from lfrtorch.model import check_channels
+from lfrtorch.model.model import check_channels
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.evaluation import Evaluation
 

@@ -15,9 +15,9 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.cli.composition import started
 from lfrtorch.cli.simulate import chosen, introduced, opened
-from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
+from lfrtorch.model.extended_kalman_filter import NoiseCovariance
+from lfrtorch.model.model import Model
 
 
 def written(cfg: DictConfig) -> None:

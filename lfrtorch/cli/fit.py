@@ -47,7 +47,7 @@ from lfrtorch.cli.run_folder import (
     resumable,
     world,
 )
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
 from lfrtorch.distributed import ProcessLostError, connect, current
 from lfrtorch.fitting.observer import Watching
 from lfrtorch.fitting.settings import Settings
@@ -55,7 +55,7 @@ from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import FitResult, Round, StoppedError
 from lfrtorch.job import identify
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 from lfrtorch.reporting.console import Console
 from lfrtorch.reporting.monitor import Checkpoint, TensorBoard, quiet_writers
 from lfrtorch.reporting.run_files import write

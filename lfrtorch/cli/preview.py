@@ -15,12 +15,12 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import real
 from lfrtorch.cli.composition import started
 from lfrtorch.cli.wording import as_words
+from lfrtorch.data.periods import find_period
+from lfrtorch.data.records import Record, check_rate
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.glance import Glance, look_at
 from lfrtorch.files.load import EVERYTHING, is_fraction, listed_files, stem_of
 from lfrtorch.linear.record_start import try_starts
-from lfrtorch.periods import find_period
-from lfrtorch.records import Record, check_rate
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.measurement import survey_measurement
 from lfrtorch.survey.notes import examine

@@ -20,7 +20,11 @@ from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import expanded, real
 from lfrtorch.cli.composition import started
-from lfrtorch.file_simulation import (
+from lfrtorch.files.load import listed_files
+from lfrtorch.files.stream import FileStream
+from lfrtorch.files.writer import FORMATS
+from lfrtorch.reporting.score_columns import of_samples
+from lfrtorch.use.file_simulation import (
     Simulated,
     Start,
     estimated_start,
@@ -29,10 +33,6 @@ from lfrtorch.file_simulation import (
     simulate_file,
     start_at_rest,
 )
-from lfrtorch.files.load import listed_files
-from lfrtorch.files.stream import FileStream
-from lfrtorch.files.writer import FORMATS
-from lfrtorch.reporting.score_columns import of_samples
 
 
 def simulate(cfg: DictConfig) -> None:

@@ -29,9 +29,9 @@ from numpy.typing import ArrayLike
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.data.dataset import Dataset, Published
+from lfrtorch.data.records import Record
 from lfrtorch.datasets import official
-from lfrtorch.records import Record
 
 __all__ = ["load", "multisine", "simulate", "sweep"]
 

@@ -22,9 +22,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record
 from lfrtorch.datasets import official
-from lfrtorch.records import Record
 
 __all__ = ["load"]
 

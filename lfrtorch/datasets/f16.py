@@ -34,10 +34,10 @@ from pathlib import Path
 import numpy as np
 
 from lfrtorch._support.errors import InputError
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.data.dataset import Dataset, Published
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Record
 from lfrtorch.datasets import official
-from lfrtorch.metrics import rms
-from lfrtorch.records import Record
 
 __all__ = ["load"]
 

@@ -28,9 +28,9 @@ import numpy as np
 from lfrtorch._support.checks import integer, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record
 from lfrtorch.datasets import official
-from lfrtorch.records import Record
 
 __all__ = ["LEVELS", "load"]
 

@@ -35,9 +35,9 @@ from jaxtyping import Float
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.data.dataset import Dataset, Published
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.datasets import official
-from lfrtorch.records import Channel, Record
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from lfrtorch._support.checks import number, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.dataset import Published
-from lfrtorch.records import Channel, Record, Start
+from lfrtorch.data.dataset import Published
+from lfrtorch.data.records import Channel, Record, Start
 
 Shape = tuple[int | None, ...]
 """Of an array in a file; None for an axis of any length."""

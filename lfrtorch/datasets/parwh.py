@@ -27,10 +27,10 @@ import numpy as np
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record
 from lfrtorch.datasets import official
 from lfrtorch.datasets.parwh_simulator import FS, PERIOD, Signals, multisine, simulate, stand_in
-from lfrtorch.records import Record
 
 __all__ = ["LEVELS", "load", "multisine", "simulate"]
 

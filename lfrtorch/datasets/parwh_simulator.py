@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.metrics import rms as rms_of
+from lfrtorch.data.metrics import rms as rms_of
 
 FS = 78125.0
 """Sampling frequency of the records, Hz."""

@@ -20,9 +20,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from lfrtorch._support.checks import integer
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record
 from lfrtorch.datasets import official
-from lfrtorch.records import Record
 
 __all__ = ["load"]
 

@@ -33,9 +33,9 @@ from pathlib import Path
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record
 from lfrtorch.datasets import official
-from lfrtorch.records import Record
 
 __all__ = ["load"]
 

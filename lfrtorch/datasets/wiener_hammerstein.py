@@ -17,7 +17,7 @@ from pathlib import Path
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
 from lfrtorch.datasets import official
 
 __all__ = ["load"]

@@ -11,8 +11,8 @@ import numpy as np
 from lfrtorch._support.roots import beyond, frequency_and_damping
 from lfrtorch._support.tables import Cell, factor_of, number, radius, table
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Channel
 from lfrtorch.engine.operating_point import StateSpace
-from lfrtorch.records import Channel
 
 _MOST_POLES, _MOST_GAINS = 6, 4
 """Most rows of the tables; poles of the largest radius are kept."""

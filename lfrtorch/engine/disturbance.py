@@ -21,9 +21,9 @@ import torch
 from jaxtyping import Float
 
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Scaler
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.operating_point import StateSpace
-from lfrtorch.records import Scaler
 
 _DRIFT = 0.1
 """By so much of its scale a disturbance drifts in the slowest time constant, rms."""

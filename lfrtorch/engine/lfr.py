@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from lfrtorch._support.errors import InputError
+from lfrtorch.data.records import Start, check_start
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.differentiable import Simulation
 from lfrtorch.engine.simulation import Trajectory, simulate, steady_state
-from lfrtorch.records import Start, check_start
 
 _UNCOMPILED: list[Any] = []
 """The simulation as ``torch.compile`` calls it: made with the compiler's first use, which takes a

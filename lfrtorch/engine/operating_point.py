@@ -15,10 +15,10 @@ from torch import Tensor
 
 from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Scaler
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import static_slope
 from lfrtorch.engine.simulation import simulate
-from lfrtorch.records import Scaler
 
 _MAX_NEWTON, HALVINGS = 50, 30
 """Most steps of Newton's method, and most times that a step is halved."""

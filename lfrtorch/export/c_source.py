@@ -17,11 +17,11 @@ from lfrtorch.export.equations import (
     equations,
     observer_equations,
 )
-from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.formula_code import PYTHON, statements, with_slopes
 from lfrtorch.maps.operations import Formula
-from lfrtorch.model import Model
+from lfrtorch.model.extended_kalman_filter import NoiseCovariance
+from lfrtorch.model.model import Model
 
 _LINE = 96
 """Most columns of a line of numbers."""

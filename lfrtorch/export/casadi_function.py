@@ -12,10 +12,10 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
 from lfrtorch.export.equations import KalmanNoise, check_name, equations, observer_equations
-from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.operations import Formula
-from lfrtorch.model import Model
+from lfrtorch.model.extended_kalman_filter import NoiseCovariance
+from lfrtorch.model.model import Model
 
 
 def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:

@@ -11,7 +11,7 @@ from lfrtorch.linear.control import control_labels
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.formula_code import PYTHON, statements
 from lfrtorch.maps.operations import Formula
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 _NUMPY = {
     name: text.replace("math.a", "np.arc").replace("math.", "np.") for name, text in PYTHON.items()

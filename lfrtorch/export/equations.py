@@ -16,15 +16,15 @@ from torch.nn import Module
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.data_reach import DataReach
+from lfrtorch.data.records import Channel
 from lfrtorch.engine.cell import Matrices
 from lfrtorch.engine.operating_point import double, equilibrium
-from lfrtorch.extended_kalman_filter import NoiseCovariance, data_root
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.static_map import StaticMap
 from lfrtorch.maps.written import Written
-from lfrtorch.model import NO_OBSERVER, Model
-from lfrtorch.records import Channel
+from lfrtorch.model.data_reach import DataReach
+from lfrtorch.model.extended_kalman_filter import NoiseCovariance, data_root
+from lfrtorch.model.model import NO_OBSERVER, Model
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.export.c_source import c_source
 from lfrtorch.export.equations import Equations, equations, printable
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 _OTHERS = {
     2: ["Integer", "Boolean", "String"],

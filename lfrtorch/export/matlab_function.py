@@ -16,9 +16,9 @@ from lfrtorch.export.equations import (
     equations,
     observer_equations,
 )
-from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
+from lfrtorch.model.extended_kalman_filter import NoiseCovariance
+from lfrtorch.model.model import Model
 
 
 def matlab_function(

@@ -19,7 +19,7 @@ from lfrtorch.export.traced_map import IR, OPSET, traced
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.operations import Formula
 from lfrtorch.maps.written import Written
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 
 def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, Any]:

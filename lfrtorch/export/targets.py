@@ -20,9 +20,9 @@ from lfrtorch.export.equations import check_name, equations
 from lfrtorch.export.fmu import write_fmu
 from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
-from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Disturbance, Model
+from lfrtorch.model.extended_kalman_filter import NoiseCovariance
+from lfrtorch.model.model import Disturbance, Model
 
 
 class Target(NamedTuple):

@@ -12,9 +12,9 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.runs import find_runs, is_run
 from lfrtorch._support.sampling import Piece
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Channel, check_largest, check_rate
 from lfrtorch.files.table import BLOCK, Columns, Table
 from lfrtorch.files.time_base import TimeBase, find_base, on_grid
-from lfrtorch.records import Channel, check_largest, check_rate
 
 LARGEST = 2**22
 """Values that are read of a file, of all channels together: what comes after is not looked at."""

@@ -18,7 +18,10 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.paths import expanded, real
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.periods import find_period, find_transient
+from lfrtorch.data.records import Record
+from lfrtorch.data.score_window import SHORTEST, warm_up
 from lfrtorch.files.excel import workbook
 from lfrtorch.files.formats import similar
 from lfrtorch.files.frame import frame_tables
@@ -32,9 +35,6 @@ from lfrtorch.files.measurement import (
 from lfrtorch.files.split import TooShortError, cut
 from lfrtorch.files.table import Columns, NoColumnError, Table
 from lfrtorch.linear.record_start import try_starts
-from lfrtorch.periods import find_period, find_transient
-from lfrtorch.records import Record
-from lfrtorch.score_window import SHORTEST, warm_up
 from lfrtorch.survey.integration import integrators
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from lfrtorch._support.errors import InputError, brief
+from lfrtorch.data.records import Channel
 from lfrtorch.files.arrays import optional
 from lfrtorch.files.series import Series, SeriesTable
 from lfrtorch.files.table import Table
 from lfrtorch.files.time_stamps import is_time, time_unit
-from lfrtorch.records import Channel
 
 _LONGEST = 16
 """Entries of an array in a message that are channels."""

@@ -16,10 +16,10 @@ from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.sampling import Piece
 from lfrtorch._support.types import Array, Booleans
+from lfrtorch.data.records import Channel, interpolated
 from lfrtorch.files.formats import Table, open_table
 from lfrtorch.files.table import Columns
 from lfrtorch.files.time_base import OnGrid, find_base, on_grid
-from lfrtorch.records import Channel, interpolated
 
 Gaps = Literal["error", "split"]
 

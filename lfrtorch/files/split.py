@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from lfrtorch._support.errors import InputError
-from lfrtorch.records import Record
-from lfrtorch.score_window import SHORTEST
+from lfrtorch.data.records import Record
+from lfrtorch.data.score_window import SHORTEST
 
 
 class TooShortError(InputError):

@@ -11,11 +11,11 @@ import numpy as np
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.sampling import UnevenError, sampling
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Channel
 from lfrtorch.files.formats import BLOCK, open_table
 from lfrtorch.files.table import Columns, NoColumnError
 from lfrtorch.files.time_base import find_base
 from lfrtorch.files.time_stamps import time_unit
-from lfrtorch.records import Channel
 
 _SAME = 1e-3  # relative difference of sampling frequencies that counts as none: clocks differ
 

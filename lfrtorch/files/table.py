@@ -16,7 +16,7 @@ from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.headers import names_and_units
 from lfrtorch._support.memory import check_memory
 from lfrtorch._support.types import Array
-from lfrtorch.records import Channel
+from lfrtorch.data.records import Channel
 
 Columns = str | int | Sequence[str | int]
 """Columns of a table by their names or numbers: one or several."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from lfrtorch._support.sampling import Sampling, UnevenError, sampling
 from lfrtorch._support.types import Array
-from lfrtorch.records import Channel
+from lfrtorch.data.records import Channel
 
 _NAMES = re.compile(
     r"(t|time|zeit|uhrzeit|timestamps?|time[ _-]?stamps?|date[ _-]?time|date|sec|seconds?|x_value)",

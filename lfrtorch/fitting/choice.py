@@ -10,7 +10,7 @@ from an estimated state, as on new data. Both errors count alike:
    where the last one ended, all towards the same start, and simulates by the mean of its starts.
    A start that does not forget where it began (``lfrtorch.fitting.forgetting``) takes no part.
 3. Of a size the largest ridge is taken that does as well as its best one, and of the sizes the
-   fewest parameters that do about as well as the best (``lfrtorch.paired_blocks``).
+   fewest parameters that do about as well as the best (``lfrtorch.data.paired_blocks``).
 
 What a choice of many is worth is not its own error, which is the least of many. So the choice is
 made again without each of the stretches, and judged there (nested cross-validation): the errors of
@@ -45,6 +45,8 @@ from lfrtorch._support.tables import percent, quantity, radius
 from lfrtorch._support.threads import each_alone, worth_threads
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
+from lfrtorch.data.paired_blocks import Judge
+from lfrtorch.data.records import Record, Scaler, as_records
 from lfrtorch.distributed import agreed
 from lfrtorch.fitting.folds import Fold, as_folded, folds
 from lfrtorch.fitting.forgetting import forgets
@@ -59,9 +61,7 @@ from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.least_squares.term import Seen
 from lfrtorch.linear.bla import refined_near
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
-from lfrtorch.paired_blocks import Judge
-from lfrtorch.records import Record, Scaler, as_records
+from lfrtorch.model.model import Model
 
 Sizes = dict[str, int]
 

@@ -18,10 +18,10 @@ from torch.nn.functional import pad
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Record
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 from lfrtorch.survey.signal import band
 
 _DAMPING = 0.03  # damping ratio of the modes

@@ -8,11 +8,11 @@ from dataclasses import replace
 from typing import Any
 
 from lfrtorch._support.tables import quantity
+from lfrtorch.data.records import Record, common_unit
 from lfrtorch.distributed import current
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Data, Job, Stage, best_start
 from lfrtorch.fitting.trainer import FitResult, Trainer
-from lfrtorch.records import Record, common_unit
 
 
 class FirstPart(Stage):

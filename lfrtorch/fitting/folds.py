@@ -19,8 +19,8 @@ import numpy as np
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
-from lfrtorch.records import Record, as_records, without_coordinates
-from lfrtorch.score_window import SHORTEST, score_window, with_window
+from lfrtorch.data.records import Record, as_records, without_coordinates
+from lfrtorch.data.score_window import SHORTEST, score_window, with_window
 
 
 class Fold(NamedTuple):

@@ -25,10 +25,10 @@ from torch import Tensor
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.tables import percent
+from lfrtorch.data.records import Record, as_records
 from lfrtorch.engine.simulation import simulate
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.model.model import Model
 
 LIMIT = 0.02
 """Distance, over the outputs' deviation, up to which outputs have met."""

@@ -18,14 +18,14 @@ import torch
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import quantity
+from lfrtorch.data.records import Record
 from lfrtorch.engine.held import held_parameters, measured_states
 from lfrtorch.fitting.given_entries import transformed
 from lfrtorch.fitting.stage import Data, Job, Stage, best_start
 from lfrtorch.fitting.trainer import FitResult, Trainer
 from lfrtorch.fitting.windows import windows_from_outputs
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 PARTS = (0.1, 0.3)
 """Of the horizon, that windows have first."""

@@ -24,7 +24,7 @@ from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import Matrices
 from lfrtorch.fitting.stage import Job, Stage
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 Given = Mapping[str, Any]
 """Matrices of an NL-LFR by name, in physical units; NaN stands for what is free."""

@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lfrtorch._support.tables import number, quantity
+from lfrtorch.data.records import Record, Scaler, common_unit, rms_scale
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.held import no_feedthrough
 from lfrtorch.engine.lfr import LFR
@@ -28,15 +29,14 @@ from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Job, Stage
 from lfrtorch.fitting.trainer import FitResult, StartDivergesError, Trainer
 from lfrtorch.fitting.windows import in_windows
-from lfrtorch.known import Known
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.direct_sum import DirectSum
 from lfrtorch.maps.known_map import KnownModel
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.static_map import StaticMap, as_map
-from lfrtorch.model import Model
-from lfrtorch.records import Record, Scaler, common_unit, rms_scale
+from lfrtorch.model.known import Known
+from lfrtorch.model.model import Model
 
 _ITERATIONS = 240
 """Of the first fit, to the parameters alone; there are few of them."""

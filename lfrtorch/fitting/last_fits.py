@@ -12,6 +12,7 @@ import torch
 from lfrtorch._support.reasons import CUT_SHORT, Reason
 from lfrtorch._support.tables import quantity
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
+from lfrtorch.data.records import Record, common_unit
 from lfrtorch.distributed import agreed
 from lfrtorch.fitting.first_fit import cost_in_full
 from lfrtorch.fitting.means import mean_model
@@ -22,7 +23,6 @@ from lfrtorch.fitting.state_scaling import scale_states
 from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
-from lfrtorch.records import Record, common_unit
 
 _AVERAGED, _POOR = 3, 2.0
 """Starts of a mean that no held-out record judges, and their training errors over the least, at

@@ -10,6 +10,7 @@ import torch
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number, quantity
+from lfrtorch.data.records import Record
 from lfrtorch.distributed import agreed
 from lfrtorch.fitting.from_outputs import begins_at_outputs
 from lfrtorch.fitting.observer import Observer
@@ -21,7 +22,6 @@ from lfrtorch.linear.measured_states import measured_states_model
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan, scan_orders
 from lfrtorch.linear.requirements import excited_directions
-from lfrtorch.records import Record
 
 
 class BestLinear(Stage):

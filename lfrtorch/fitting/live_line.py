@@ -12,9 +12,9 @@ from time import monotonic
 from typing import TextIO
 
 from lfrtorch._support.tables import quantities
+from lfrtorch.data.records import common_unit
 from lfrtorch.fitting.trainer import Progress, Round
-from lfrtorch.model import Model
-from lfrtorch.records import common_unit
+from lfrtorch.model.model import Model
 
 _DIGITS = 4  # significant digits of errors: an iteration often moves the fourth alone
 

@@ -16,7 +16,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell, Matrices
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.maps.direct_sum import DirectSum
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 
 @typed()

@@ -39,6 +39,9 @@ from lfrtorch._support.reasons import CUT_SHORT, Reason, told
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.analysis.static_slopes import infinite_slope
+from lfrtorch.data.paired_blocks import Judge
+from lfrtorch.data.records import Record, as_records, common_unit
+from lfrtorch.data.score_window import with_window
 from lfrtorch.distributed import Ranks, current, using
 from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.forgetting import forgets
@@ -69,10 +72,7 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.least_squares.shared_problem import same_weights
-from lfrtorch.model import Model
-from lfrtorch.paired_blocks import Judge
-from lfrtorch.records import Record, as_records, common_unit
-from lfrtorch.score_window import with_window
+from lfrtorch.model.model import Model
 
 ROUNDS = (1 / 16, 1 / 8)
 """Parts of the iterations after which the worse half is left."""

@@ -10,10 +10,10 @@ import scipy
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.types import Array
-from lfrtorch.extended_kalman_filter import NoiseCovariance, inside_limits
+from lfrtorch.data.records import Record, as_records, rms_scale
 from lfrtorch.fitting.state_scaling import state_moment
-from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records, rms_scale
+from lfrtorch.model.extended_kalman_filter import NoiseCovariance, inside_limits
+from lfrtorch.model.model import Model
 
 
 @typed()

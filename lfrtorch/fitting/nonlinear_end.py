@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Record
 from lfrtorch.engine.simulation import Trajectory
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 SAMPLES = 1 << 16  # most that are looked at, at equal distances, as more tell the same
 _DEGREE = 7  # of the polynomials; Wiener and Hammerstein systems are told less well by a third

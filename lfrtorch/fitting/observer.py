@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
 from lfrtorch.fitting.live_line import LiveLine, ProgressLine, StartsLine
 from lfrtorch.fitting.multistart import line_of, schedule
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult, Monitor, Round
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 
 class Watching(NamedTuple):

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from lfrtorch.data.records import Record, as_records, with_past_outputs
 from lfrtorch.fitting.trainer import Monitor
-from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records, with_past_outputs
+from lfrtorch.model.model import Model
 
 
 def without_gain(models: Model | Sequence[Model]) -> Model | list[Model]:

@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 
 from lfrtorch._support.arguments import typed
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record, as_records, measured_signals
 from lfrtorch.distributed import current, using
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.fitting.trainer import FitResult, Monitor, Stop, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.ridge import Ridge
-from lfrtorch.records import Record, as_records, measured_signals
 
 
 @typed()

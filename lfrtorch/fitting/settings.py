@@ -20,11 +20,11 @@ from lfrtorch.engine.held import IN_SERIES
 from lfrtorch.fitting.exclusions import USUAL, refuse_together
 from lfrtorch.fitting.plain_settings import PlainSettings, Size
 from lfrtorch.fitting.trainer import Trainer
-from lfrtorch.known import Known
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.model import Model
+from lfrtorch.model.known import Known
+from lfrtorch.model.model import Model
 
 LAST_SIZE = {"network": "nn", "polynomial": "degree"}
 """The third size of a static nonlinearity, after nz and nw."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.threads import each_alone, worth_threads
 from lfrtorch.fitting.trainer import Fit, Monitor, Progress, Stop
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 
 def any_of(halt: Event, stop: Stop | None) -> Stop:

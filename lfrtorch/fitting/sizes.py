@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, cast
 
+from lfrtorch.data.records import Record
 from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.exclusions import allowed
 from lfrtorch.fitting.first_fit import part_of
@@ -19,8 +20,7 @@ from lfrtorch.fitting.stage import Job, Stage
 from lfrtorch.fitting.start_models import STARTS_OF_CHOSEN, starting_model
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 _CHOOSING = 20_000
 """Training samples that sizes are chosen with, at most."""

@@ -21,7 +21,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from lfrtorch._support.reasons import CUT_SHORT
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record
 from lfrtorch.fitting.choice import Choice
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.observer import Observer
@@ -31,8 +32,7 @@ from lfrtorch.fitting.trainer import FitResult, Stop, StoppedError, Trainer
 from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 _LATER: Any = None
 """Of a field that a later stage fills."""

@@ -9,6 +9,7 @@ from inspect import signature
 
 import torch
 
+from lfrtorch.data.records import Record
 from lfrtorch.fitting.multistart import cheap_starts
 from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.fitting.settings import Settings
@@ -16,8 +17,7 @@ from lfrtorch.fitting.stage import Job, Stage
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.windows import in_windows
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model, check_channels
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model, check_channels
 
 STARTS_OF_CHOSEN = 4
 """Starts of a model of chosen sizes, at least; all go to the end, where it shows which are good."""

@@ -14,6 +14,7 @@ from torch.nn import Module
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
+from lfrtorch.data.records import Record, Scaler, as_records, rms_scale, without_coordinates
 from lfrtorch.engine import held
 from lfrtorch.engine.cell import LFRCell, check_dtype
 from lfrtorch.engine.lfr import LFR
@@ -24,8 +25,7 @@ from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.modes import without_slow_minor_modes
 from lfrtorch.maps.network import Network
-from lfrtorch.model import Model
-from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
+from lfrtorch.model.model import Model
 
 _OUTPUT_RANGE = 0.3
 """Bw, Dyw ~ U(-0.3, 0.3) of the ``"zero_output"`` start."""

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import torch
 
+from lfrtorch.data.records import Record
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.model import Model, state_moment
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model, state_moment
 
 
 @torch.no_grad()

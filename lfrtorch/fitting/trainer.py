@@ -17,6 +17,7 @@ from torch import Tensor
 from lfrtorch._support.errors import InputError, LfrtorchError
 from lfrtorch._support.reasons import Reason, told
 from lfrtorch._support.threads import spread_by_hand
+from lfrtorch.data.records import Record, as_records
 from lfrtorch.distributed import ProcessLostError
 from lfrtorch.fitting import state_file
 from lfrtorch.fitting.fit_state import FitState, Progress
@@ -27,8 +28,7 @@ from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.least_squares.search import Search
 from lfrtorch.least_squares.shared_problem import problem_of
-from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.model.model import Model
 
 EXPLOSION = 100.0
 """Growth of the squared validation error, beyond the start's, in a step that is taken back."""

@@ -45,7 +45,7 @@ import numpy as np
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
 
 BEFORE = 20
 """Outputs for each state before a window of validation. Of good models of the wells in

@@ -33,12 +33,12 @@ from lfrtorch._support.tables import engineering, number, table
 from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import levels_of, vector
+from lfrtorch.data.records import Channel
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.operating_point import double
 from lfrtorch.maps.activations import ACTIVATIONS, FAR
 from lfrtorch.maps.enclosure import Enclosure, Interval, everywhere
-from lfrtorch.model import Model
-from lfrtorch.records import Channel
+from lfrtorch.model.model import Model
 
 _LONGEST = 2**16
 """Most samples of an impulse response that are summed; slower ones have a looser bound."""

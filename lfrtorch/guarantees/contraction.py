@@ -17,7 +17,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import factor_of, number
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import levels_of
-from lfrtorch.data_reach import Cloud, DataReach
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import linearise, spectral_radius
 from lfrtorch.engine.operating_point import double
@@ -32,8 +32,8 @@ from lfrtorch.guarantees.certificate import (
 )
 from lfrtorch.maps.activations import FAR
 from lfrtorch.maps.enclosure import ROUNDING, Enclosure, Interval, everywhere
-from lfrtorch.model import Model
-from lfrtorch.records import Channel, Record
+from lfrtorch.model.data_reach import Cloud, DataReach
+from lfrtorch.model.model import Model
 
 _FARTHEST = 2.0**20
 """Factor of the data's rms to within which the largest amplitude is looked for."""

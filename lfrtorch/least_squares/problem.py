@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._support.errors import InputError
+from lfrtorch.data.records import Record, as_records, of_one_unit
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
@@ -25,8 +26,7 @@ from lfrtorch.least_squares.record_groups import EVERY
 from lfrtorch.least_squares.ridge import Ridge, RidgePenalty, ridge_by_entry
 from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.least_squares.term import Term
-from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records, of_one_unit
+from lfrtorch.model.model import Model
 
 State = TypeVar("State")
 

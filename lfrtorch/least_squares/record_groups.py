@@ -16,9 +16,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import NormalisedRecord, Record, Start
 from lfrtorch.engine.initial_state import measured_start
 from lfrtorch.engine.weights import Weights
-from lfrtorch.records import NormalisedRecord, Record, Start
 
 EVERY = slice(None)
 

@@ -15,14 +15,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._support.errors import InputError
+from lfrtorch.data.records import Record, as_records
 from lfrtorch.distributed import Ranks, current
 from lfrtorch.least_squares.guarantee import Name, guarantee_of
 from lfrtorch.least_squares.jacobian import Jacobian
 from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator, System
 from lfrtorch.least_squares.problem import Problem, errors_of
 from lfrtorch.least_squares.ridge import Ridge
-from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.model.model import Model
 
 
 def problem_of(model: Model, records: Record | Sequence[Record], **options: Any) -> Problem:

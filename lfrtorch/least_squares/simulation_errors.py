@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lfrtorch._support.threads import has_kernels
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import NormalisedRecord
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.initial_state import estimated_start, start_from_beginning
 from lfrtorch.engine.sensitivity import Linearisation
@@ -19,7 +20,6 @@ from lfrtorch.engine.weights import Weights
 from lfrtorch.least_squares.output_rows import Memory, OutputRows
 from lfrtorch.least_squares.record_groups import EVERY, group_records
 from lfrtorch.least_squares.term import Seen
-from lfrtorch.records import NormalisedRecord
 
 
 class Parameters:

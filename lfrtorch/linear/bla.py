@@ -21,6 +21,8 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number, radius
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Record, Scaler, as_records, without_coordinates
 from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.integrators import (
     differenced,
@@ -61,9 +63,7 @@ from lfrtorch.linear.spectral_data import (
     spectral_data_of_response,
 )
 from lfrtorch.linear.subspace import SubspaceEstimate
-from lfrtorch.metrics import rms
-from lfrtorch.model import state_moment
-from lfrtorch.records import Record, Scaler, as_records, without_coordinates
+from lfrtorch.model.model import state_moment
 
 Criterion = Literal["simulation", "prediction", "frequency"]
 

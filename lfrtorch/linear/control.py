@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from lfrtorch._support.optional import imported
-from lfrtorch.records import Channel
+from lfrtorch.data.records import Channel
 
 
 def control_system(model: Any) -> Any:

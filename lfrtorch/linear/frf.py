@@ -24,6 +24,7 @@ from lfrtorch._support.checks import dft_lines, integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array, Complex, Integers
+from lfrtorch.data.records import Channel, Record, as_records
 from lfrtorch.linear.local_polynomial import WindowErrors, fit_local_polynomials, half_width
 from lfrtorch.linear.realisations import united
 from lfrtorch.linear.regression import Regression, covariance, divided, outer, regress
@@ -36,7 +37,6 @@ from lfrtorch.linear.spectra import (
     spectra_of_records,
     without_noise,
 )
-from lfrtorch.records import Channel, Record, as_records
 
 Method = Literal["auto", "robust", "fast", "local_polynomial"]
 

@@ -29,12 +29,12 @@ from jaxtyping import Bool
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Booleans
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Channel, NormalisedRecord, Record, Scaler, interpolated
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearFit, LinearModel, linear_cell
-from lfrtorch.metrics import rms
-from lfrtorch.model import simulate_record
-from lfrtorch.records import Channel, NormalisedRecord, Record, Scaler, interpolated
+from lfrtorch.model.model import simulate_record
 
 _SAME_LINE = 1e-9
 """Distance from z = 1 below which a line is the one at 0, where the response is infinite."""

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lfrtorch.data.records import Record, Scaler
 from lfrtorch.linear.model import LinearFit, LinearModel
-from lfrtorch.records import Record, Scaler
 
 _RIDGE = 1e-9
 """Of the squares of regressors of unit rms: it holds the weight of one that does not vary at 0."""

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array, Complex
+from lfrtorch.data.records import Channel, Record, Scaler, without_coordinates
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import linear_text, listed
 from lfrtorch.engine.lfr import LFR
@@ -28,8 +29,7 @@ from lfrtorch.linear.resolvent import (
     unit_circle,
 )
 from lfrtorch.linear.zeros import finite_zeros
-from lfrtorch.model import Model, read_model, write_model
-from lfrtorch.records import Channel, Record, Scaler, without_coordinates
+from lfrtorch.model.model import Model, read_model, write_model
 
 
 @dataclass(frozen=True)

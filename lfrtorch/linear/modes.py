@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Complex128, Float
 
 from lfrtorch._support.types import Array, Complex
+from lfrtorch.data.records import Channel, Record, as_records, rms_scale, without_coordinates
 from lfrtorch.linear.balancing import balancing
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.records import Channel, Record, as_records, rms_scale, without_coordinates
 
 MINOR = 1 / 3
 """Largest share in the output that counts as minor. Of the linear models of Bouc-Wen,

@@ -19,6 +19,8 @@ import numpy as np
 
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Record, Scaler
 from lfrtorch.least_squares.search import Search
 from lfrtorch.linear.bla import Settings, default_criterion, physical, pose
 from lfrtorch.linear.frf import FRF
@@ -30,8 +32,6 @@ from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
 from lfrtorch.linear.spectral_data import spectral_data_of_parts
 from lfrtorch.linear.subspace import SpectralSubspace, spectral_subspaces
-from lfrtorch.metrics import rms
-from lfrtorch.records import Record, Scaler
 
 Window = tuple[int, int]
 """First sample, and the one after the last."""

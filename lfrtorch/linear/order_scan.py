@@ -1,6 +1,6 @@
 """Order of the BLA: a scan over nx, scored on records that are not fitted.
 
-The fewest states are taken that do as well as the best, see ``lfrtorch.paired_blocks``. Where the
+The fewest states are taken that do as well as the best (``data.paired_blocks``). Where the
 validation records are short against the system's memory, or unlike the training records, they say
 little of an order: the scores are then those of a cross-validation in time over both. Each of five
 stretches is left out of a fit to the rest, and scored in a simulation of its whole record.
@@ -25,21 +25,21 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number, quantity
 from lfrtorch._support.threads import each_alone
 from lfrtorch._support.types import Array
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.paired_blocks import (
+    BLOCKS,
+    MARGIN,
+    Judge,
+    no_progress,
+)
+from lfrtorch.data.records import Record, Scaler, as_records, measured_signals, without_coordinates
+from lfrtorch.data.score_window import with_window
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.integrators import integrators_of
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_fits import OrderFits, Window, description_length, fitted
 from lfrtorch.linear.requirements import check_length, check_signals, excited_directions
-from lfrtorch.metrics import rms
-from lfrtorch.paired_blocks import (
-    BLOCKS,
-    MARGIN,
-    Judge,
-    no_progress,
-)
-from lfrtorch.records import Record, Scaler, as_records, measured_signals, without_coordinates
-from lfrtorch.score_window import with_window
 
 _FOLDS = 5
 """Stretches of a cross-validation."""

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Complex128, Int64
 
 from lfrtorch._support.types import Array, Complex, Integers
+from lfrtorch.data.records import Record
 from lfrtorch.linear.regression import outer
 from lfrtorch.linear.spectra import RELATIVE_POWER, Spectra
-from lfrtorch.records import Record
 
 ALIKE = 0.15
 """Largest rms deviation of two spectra of one realisation, relative to them; two realisations have

@@ -13,10 +13,10 @@ import numpy as np
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import percent
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Record
+from lfrtorch.data.score_window import SHORTEST, warm_up
 from lfrtorch.linear.order_scan import scan_orders
-from lfrtorch.metrics import rms
-from lfrtorch.records import Record
-from lfrtorch.score_window import SHORTEST, warm_up
 
 _LONGEST = 3000
 """Samples that are looked at: a start is forgotten after some time constants."""

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from lfrtorch._support.errors import InputError
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.periods import find_transient
+from lfrtorch.data.records import Record
 from lfrtorch.linear.spectral_data import SpectralData
 from lfrtorch.linear.subspace import shortest, suffice
-from lfrtorch.metrics import rms
-from lfrtorch.periods import find_transient
-from lfrtorch.records import Record
 
 _REPEATS = 0.1
 """Largest deviation of periods of an input, and of the means of an output, over the signal's."""

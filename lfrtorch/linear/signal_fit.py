@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import PAST_OUTPUTS, NormalisedRecord
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.least_squares.linear_systems import SVDSystem
@@ -31,8 +32,7 @@ from lfrtorch.least_squares.term import Seen, Term, TermRows
 from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, refining
 from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_signals
-from lfrtorch.model import simulate_record
-from lfrtorch.records import PAST_OUTPUTS, NormalisedRecord
+from lfrtorch.model.model import simulate_record
 
 OBSERVERS = (1e-4, 1e-2, 1.0)
 """Variances of the state noise that the initial innovation models of a prediction-error fit assume,

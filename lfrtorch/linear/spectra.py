@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 from lfrtorch._support.checks import dft_lines
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Booleans, Complex, Integers
+from lfrtorch.data.records import Record
 from lfrtorch.linear.regression import outer
-from lfrtorch.records import Record
 
 RELATIVE_POWER = 1e-4
 """Smallest power of each input at an excited line, relative to its best line: -40 dB."""

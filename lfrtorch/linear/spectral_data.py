@@ -17,6 +17,7 @@ from jaxtyping import Complex128, Float
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
+from lfrtorch.data.records import NormalisedRecord, Scaler, rms_scale
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.local_polynomial import WindowErrors
 from lfrtorch.linear.regression import outer
@@ -28,7 +29,6 @@ from lfrtorch.linear.spectra import (
     smoothed,
     without_noise,
 )
-from lfrtorch.records import NormalisedRecord, Scaler, rms_scale
 
 Weight = Literal["total", "noise", "none"]
 

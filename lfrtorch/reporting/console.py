@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lfrtorch._support.tables import in_lines
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import common_unit
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.multistart import iterations_of, schedule
 from lfrtorch.fitting.observer import Observer, Watching
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
-from lfrtorch.records import common_unit
+from lfrtorch.model.model import Model
 
 
 class Console(Observer):

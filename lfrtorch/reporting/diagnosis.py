@@ -18,13 +18,13 @@ from lfrtorch._support.reasons import SPENT, Reason
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.densities import noise_of_periods
 from lfrtorch.analysis.residual_analysis import Residuals
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.paired_blocks import BLOCKS, blocked_mean, in_blocks
+from lfrtorch.data.records import Record
 from lfrtorch.fitting.trainer import FitResult, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import UNLIKE
-from lfrtorch.metrics import rms
-from lfrtorch.paired_blocks import BLOCKS, blocked_mean, in_blocks
-from lfrtorch.records import Record
 from lfrtorch.reporting.evaluation import Response, has_settled, training_deviations
 from lfrtorch.reporting.explained import explained_parts
 from lfrtorch.reporting.verdict import NEITHER, Kind, Verdict

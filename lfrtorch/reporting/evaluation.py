@@ -13,13 +13,13 @@ import numpy as np
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.residual_analysis import SHORTEST, Residuals, of_simulation
 from lfrtorch.analysis.start_uncertainty import start_error
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.metrics import nrmse, rmse, rmse_by_output
+from lfrtorch.data.records import Channel, Record, of_one_unit, without_coordinates
+from lfrtorch.data.score_window import fitted
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.metrics import nrmse, rmse, rmse_by_output
-from lfrtorch.model import Model
-from lfrtorch.records import Channel, Record, of_one_unit, without_coordinates
+from lfrtorch.model.model import Model
 from lfrtorch.reporting.opponent import Opponents, output
-from lfrtorch.score_window import fitted
 
 _LINEAR, _NL_LFR = "linear", "NL-LFR"  # names of the two models
 _HOLD = "hold"  # the name of no model: what was measured stays

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from lfrtorch._support.errors import InputError
 from lfrtorch.analysis.confidence_bands import Band, Uncertainty, uncertainty
 from lfrtorch.analysis.model_plots import static_figure
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record, common_unit
 from lfrtorch.fitting.refit import estimation_records
 from lfrtorch.linear.frf import FRF, estimate_frf
-from lfrtorch.records import Record, common_unit
 from lfrtorch.reporting import linear_plots, plots
 from lfrtorch.reporting.evaluation import Response, ranked
 from lfrtorch.reporting.run import Run

@@ -29,8 +29,8 @@ from lfrtorch._support.tables import (
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import poles_at_rest
 from lfrtorch.analysis.residual_analysis import LEGEND as RESIDUALS_LEGEND
+from lfrtorch.data.records import common_unit
 from lfrtorch.fitting.choice import LEGEND, choice_table
-from lfrtorch.records import common_unit
 from lfrtorch.reporting.evaluation import Evaluation, training_deviations
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.score_columns import (

@@ -21,12 +21,12 @@ from torch.utils.tensorboard.summary import hparams
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.analysis.model_plots import static_figure
+from lfrtorch.data.records import Record
 from lfrtorch.engine.simulation import spectral_radius
 from lfrtorch.fitting.live_line import errors_of_round
 from lfrtorch.fitting.multistart import ROUNDS
 from lfrtorch.fitting.trainer import Progress, Round
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 from lfrtorch.reporting import plots
 
 

@@ -15,12 +15,12 @@ import numpy as np
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Record, Scaler, without_coordinates
+from lfrtorch.data.score_window import fitted
 from lfrtorch.linear.bla import Criterion, estimate_bla
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.metrics import rms
-from lfrtorch.records import Record, Scaler, without_coordinates
-from lfrtorch.score_window import fitted
 
 Opponents = Mapping[int | None, LinearModel]
 """Linear models by the samples that outputs are predicted ahead; None: by simulation."""

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from lfrtorch.dataset import Dataset
-from lfrtorch.records import Record
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record
 
 
 def origin(dataset: Dataset) -> dict[str, Any]:

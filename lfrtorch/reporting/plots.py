@@ -28,9 +28,9 @@ from lfrtorch._support.tables import engineering, factor_of, quantity
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.confidence_bands import Band
 from lfrtorch.analysis.densities import power_density
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Record
 from lfrtorch.fitting.trainer import Progress
-from lfrtorch.metrics import rms
-from lfrtorch.records import Record
 
 _DPI = 150  # of a figure that is written
 _MOST_POINTS = 20_000  # samples drawn of a long signal

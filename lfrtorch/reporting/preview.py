@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lfrtorch._support.arguments import typed
+from lfrtorch.data.records import Record
 from lfrtorch.linear.record_start import try_starts
-from lfrtorch.records import Record
 from lfrtorch.survey.measurement import Survey, survey_measurement
 from lfrtorch.survey.notes import examine
 

@@ -10,15 +10,15 @@ from lfrtorch._support.tables import quantity
 from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.analysis.physical_parameters import PhysicalParameters
 from lfrtorch.analysis.residual_analysis import Residuals
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import common_unit
 from lfrtorch.fitting.choice import Choice
 from lfrtorch.fitting.forgetting import Memory
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
-from lfrtorch.model import Model
-from lfrtorch.records import common_unit
+from lfrtorch.model.model import Model
 from lfrtorch.reporting import scores
 from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.evaluation import Evaluation, Response

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from lfrtorch._support import tables
-from lfrtorch.dataset import Published
+from lfrtorch.data.dataset import Published
 from lfrtorch.reporting.evaluation import CROSS, Score
 
 ALL = "all"

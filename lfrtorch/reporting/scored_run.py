@@ -9,7 +9,7 @@ from typing import cast
 
 from lfrtorch._support.threads import each_alone
 from lfrtorch.analysis.physical_parameters import physical_parameters
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
 from lfrtorch.fitting.forgetting import forgets
 from lfrtorch.fitting.from_outputs import begins_at_outputs
 from lfrtorch.fitting.linear_start import linear_records, of_linear_model, tell

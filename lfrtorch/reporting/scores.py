@@ -14,12 +14,12 @@ from lfrtorch._support.reasons import Reason
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.analysis.physical_parameters import PhysicalParameters
 from lfrtorch.analysis.residual_analysis import Residuals
-from lfrtorch.dataset import LISTED, Published
+from lfrtorch.data.dataset import LISTED, Published
+from lfrtorch.data.records import common_unit
 from lfrtorch.fitting.choice import Choice
 from lfrtorch.fitting.forgetting import Memory
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult
-from lfrtorch.records import common_unit
 from lfrtorch.reporting.evaluation import HORIZONS, Evaluation
 from lfrtorch.reporting.score_columns import Row, columns, in_units, joint_unit
 from lfrtorch.reporting.verdict import Verdict

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from lfrtorch._support.drawing import CHANNELS, LINEAR, legend_above
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Record
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 _MOST = 3  # inputs and outputs that are drawn
 _HEIGHTS = (-1.0, -0.5, 0.5, 1.0)  # parts of the way to where the training inputs seldom go

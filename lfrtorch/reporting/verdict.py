@@ -29,9 +29,9 @@ from scipy.special import stdtrit
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.tables import number, percent
 from lfrtorch._support.types import Array, Integers
+from lfrtorch.data.metrics import nrmse, rms
+from lfrtorch.data.paired_blocks import BLOCKS, Judge, in_blocks
 from lfrtorch.fitting.trainer import FitResult
-from lfrtorch.metrics import nrmse, rms
-from lfrtorch.paired_blocks import BLOCKS, Judge, in_blocks
 from lfrtorch.reporting.evaluation import CROSS, Response, has_settled, training_deviations
 
 NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"

@@ -12,8 +12,8 @@ from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import Cell, engineering, number, table
 from lfrtorch._support.types import Array
-from lfrtorch.periods import find_period
-from lfrtorch.records import Channel
+from lfrtorch.data.periods import find_period
+from lfrtorch.data.records import Channel
 from lfrtorch.survey.signal import SignalSurvey, longest_run, survey_signal
 
 

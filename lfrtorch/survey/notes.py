@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from lfrtorch._support.types import Array, Integers
-from lfrtorch.records import Record, as_records
+from lfrtorch.data.records import Record, as_records
 from lfrtorch.survey.causality import TwoSidedResponse, dead_time, two_sided_response
 from lfrtorch.survey.changes import change
 from lfrtorch.survey.integration import chain, grows, integrators, rates

@@ -8,8 +8,8 @@ import numpy as np
 import scipy
 
 from lfrtorch._support.types import Array, Booleans, Integers
-from lfrtorch.periods import find_transient
-from lfrtorch.records import Channel
+from lfrtorch.data.periods import find_transient
+from lfrtorch.data.records import Channel
 
 LEAST = 16
 """Least samples of a spectrum."""

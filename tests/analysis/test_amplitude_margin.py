@@ -6,7 +6,7 @@ import torch
 
 import lfrtorch
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
 
 
 @pytest.mark.numeric

@@ -16,11 +16,11 @@ from torch.testing import assert_close
 
 import lfrtorch
 from lfrtorch.analysis import canonical
+from lfrtorch.data.records import Record
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.simulation import simulate, steady_state
 from lfrtorch.maps.network import Network
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

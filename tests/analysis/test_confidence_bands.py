@@ -19,9 +19,9 @@ import lfrtorch
 from lfrtorch._support.types import Array
 from lfrtorch.analysis import uncertainty
 from lfrtorch.analysis.confidence_bands import Uncertainty
+from lfrtorch.data.records import Record, Start
 from lfrtorch.engine import sensitivity
-from lfrtorch.model import Model
-from lfrtorch.records import Record, Start
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

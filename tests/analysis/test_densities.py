@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lfrtorch.analysis.densities import noise_density, noise_of_periods, power_density
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
 
 pytestmark = pytest.mark.numeric
 

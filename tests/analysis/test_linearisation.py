@@ -17,7 +17,7 @@ from lfrtorch.analysis.linearisation import linear_part, poles_at_rest
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import linearise as along
 from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

@@ -17,7 +17,7 @@ from lfrtorch.analysis.correlation import autocorrelation, cross_correlation, la
 from lfrtorch.analysis.densities import noise_density, noise_of_periods, power_density
 from lfrtorch.analysis.output_residuals import OutputResiduals
 from lfrtorch.analysis.residual_analysis import Residuals, of_simulation
-from lfrtorch.records import Channel, Record
+from lfrtorch.data.records import Channel, Record
 
 pytestmark = pytest.mark.numeric
 

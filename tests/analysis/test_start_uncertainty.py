@@ -12,7 +12,7 @@ import lfrtorch
 from lfrtorch import LinearModel
 from lfrtorch.analysis import start_uncertainty
 from lfrtorch.analysis.start_uncertainty import start_error
-from lfrtorch.model import state_moment
+from lfrtorch.model.model import state_moment
 from lfrtorch.reporting import scores
 from lfrtorch.reporting.evaluation import Evaluation
 

@@ -11,7 +11,7 @@ from reference import random_cell, random_model
 
 import lfrtorch
 from lfrtorch.analysis import linearise, trim
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

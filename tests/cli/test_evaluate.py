@@ -17,7 +17,7 @@ from reference import measure, random_cell, random_model
 
 import lfrtorch
 from lfrtorch.cli import composition, evaluate, fit
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.data.dataset import Dataset, Published
 
 MODEL = random_model(random_cell(), fs=50.0)
 LINEAR = lfrtorch.LinearModel(

@@ -18,8 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 import lfrtorch
 from lfrtorch.cli import composition, errors, fit, linear
 from lfrtorch.cli.composition import composed
-from lfrtorch.dataset import Dataset
-from lfrtorch.records import Record
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record
 
 ROOT = Path(__file__).resolve().parents[2]
 T, FS, SKIP = 1200, 50.0, 100

@@ -14,10 +14,10 @@ from scipy.signal import lfilter
 
 from lfrtorch._support.tables import number
 from lfrtorch.cli import config, preview
+from lfrtorch.data.records import Channel
 from lfrtorch.files import glance
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.glance import look_at
-from lfrtorch.records import Channel
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.measurement import survey_measurement
 from lfrtorch.survey.notes import examine

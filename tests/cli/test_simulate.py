@@ -21,9 +21,9 @@ from lfrtorch._support.types import Array
 from lfrtorch.cli import evaluate, simulate
 from lfrtorch.cli.composition import composed
 from lfrtorch.cli.errors import user_errors
-from lfrtorch.file_simulation import BEGINNING
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.stream import Block, FileStream
+from lfrtorch.use.file_simulation import BEGINNING
 
 MODEL = random_model(random_cell(2, 2, 3, 2, 1, 4), fs=50.0)
 T = 300

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.io import savemat
 from scipy.signal import firwin, freqz, resample
 
-from lfrtorch import metrics
+from lfrtorch.data import metrics
 from lfrtorch.datasets import boucwen, official
 
 pytestmark = pytest.mark.numeric

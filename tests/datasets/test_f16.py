@@ -10,9 +10,10 @@ import pytest
 from scipy.io import savemat
 from scipy.signal import lfilter
 
-from lfrtorch import metrics, multisine
+from lfrtorch import multisine
 from lfrtorch.cli import fit
 from lfrtorch.cli.composition import composed
+from lfrtorch.data import metrics
 from lfrtorch.datasets import f16
 
 FOLDER = "F16/F16GVT_Files/BenchmarkData"

@@ -12,7 +12,7 @@ import pytest
 from scipy.io import savemat
 from scipy.signal import butter, cheby1, cheby2, ellip, lfilter
 
-from lfrtorch import metrics
+from lfrtorch.data import metrics
 from lfrtorch.datasets import official, parwh
 
 pytestmark = pytest.mark.numeric

@@ -11,10 +11,10 @@ import torch
 from reference import measure, random_cell, random_model
 
 import lfrtorch
+from lfrtorch.data.records import Record
 from lfrtorch.engine.held import IN_SERIES, structure
 from lfrtorch.maps.network import Network
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

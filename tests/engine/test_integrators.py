@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from lfrtorch.data.metrics import rmse
+from lfrtorch.data.records import Record
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.held import held_parameters, integrating_states, integrators
 from lfrtorch.fitting.means import mean_model
@@ -16,9 +18,7 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.metrics import rmse
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

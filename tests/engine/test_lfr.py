@@ -12,10 +12,10 @@ from torch.nn.utils.parametrizations import weight_norm
 from torch.testing import assert_close
 
 from lfrtorch._support.errors import InputError, LfrtorchError
+from lfrtorch.data.records import Start
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
-from lfrtorch.records import Start
 
 pytestmark = [
     pytest.mark.numeric,

@@ -27,10 +27,10 @@ from reference import measure, random_cell, random_model
 
 from lfrtorch import InputError, NoiseCovariance
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Channel
 from lfrtorch.export import c_source, python_source, write
-from lfrtorch.extended_kalman_filter import ExtendedKalmanFilter
-from lfrtorch.model import Model
-from lfrtorch.records import Channel
+from lfrtorch.model.extended_kalman_filter import ExtendedKalmanFilter
+from lfrtorch.model.model import Model
 
 GCC = shutil.which("gcc") or shutil.which("cc") or ""
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wshadow", "-Werror", "-pedantic"]

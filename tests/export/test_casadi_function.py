@@ -23,7 +23,7 @@ from exported import (
 from lfrtorch import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.export import casadi_function, write
-from lfrtorch.extended_kalman_filter import ExtendedKalmanFilter
+from lfrtorch.model.extended_kalman_filter import ExtendedKalmanFilter
 
 casadi = pytest.importorskip(
     "casadi", reason="casadi comes with the extra: pip install -e '.[casadi]'"

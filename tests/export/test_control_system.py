@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from exported import MODELS, check_output, check_rest, check_run, check_step, inputs, jacobians
 
+from lfrtorch.data.records import Channel
 from lfrtorch.export import control_system, python_source, write
-from lfrtorch.records import Channel
 
 control = pytest.importorskip(
     "control", reason="control comes with the extra: pip install -e '.[control]'"

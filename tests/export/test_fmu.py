@@ -17,9 +17,9 @@ from exported import MODELS, check_output, inputs, jacobians
 
 from lfrtorch import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Channel
 from lfrtorch.export import write
-from lfrtorch.model import Model
-from lfrtorch.records import Channel
+from lfrtorch.model.model import Model
 
 fmpy = pytest.importorskip("fmpy", reason="fmpy comes with the extra: pip install -e '.[fmu]'")
 

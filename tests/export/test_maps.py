@@ -21,7 +21,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.export import casadi_function, onnx_models, python_source, write
 from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.maps.static_map import StaticMap
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 
 class Constant(StaticMap):

@@ -24,7 +24,7 @@ from scipy.io import loadmat, savemat
 from lfrtorch import InputError
 from lfrtorch.analysis import lpv
 from lfrtorch.export import write
-from lfrtorch.extended_kalman_filter import ExtendedKalmanFilter
+from lfrtorch.model.extended_kalman_filter import ExtendedKalmanFilter
 
 WRITTEN = [name for name in MODELS if name not in ("known", "drag")]
 

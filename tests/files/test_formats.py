@@ -20,9 +20,9 @@ import pytest
 import scipy.io
 import scipy.sparse
 
+from lfrtorch.data.records import Channel
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.load import load_records
-from lfrtorch.records import Channel
 
 T = 40
 SIGNALS = np.random.default_rng(3).normal(size=(T, 3))

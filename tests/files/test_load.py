@@ -13,13 +13,13 @@ import scipy.io
 import scipy.signal
 
 from lfrtorch import load_records
-from lfrtorch.excitation import multisine
+from lfrtorch.data.excitation import multisine
+from lfrtorch.data.records import Channel
 from lfrtorch.files import load
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.glance import look_at
 from lfrtorch.files.text import TextTable
 from lfrtorch.linear.record_start import StartTrial
-from lfrtorch.records import Channel
 
 SAMPLES = 200
 USE: dict[str, Any] = {"inputs": ["u1", "u2"], "outputs": "y", "fs": 50.0, "start": "zero"}

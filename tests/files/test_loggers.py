@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lfrtorch import InputError, load_records
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.series import Series, SeriesTable
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from lfrtorch.data.records import Channel
 from lfrtorch.files.stream import FileStream
-from lfrtorch.records import Channel
 
 FS, T = 750.0, 1000
 INPUTS, OUTPUTS = (Channel("u1", "N"), Channel("u2")), (Channel("y", "mm"),)

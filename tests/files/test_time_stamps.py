@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lfrtorch._support.sampling import UnevenError, sampling
+from lfrtorch.data.records import Channel
 from lfrtorch.files.time_stamps import column_sampling, is_time, time_unit
-from lfrtorch.records import Channel
 
 pytestmark = pytest.mark.numeric
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lfrtorch.excitation import multisine
+from lfrtorch.data.excitation import multisine
+from lfrtorch.data.metrics import rmse
+from lfrtorch.data.records import Record
 from lfrtorch.fitting.driven_states import distortion_frequencies, relaxation_frequencies
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.bla import estimate_bla
-from lfrtorch.metrics import rmse
-from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric
 

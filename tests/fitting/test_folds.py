@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lfrtorch.data.records import Record, Start
 from lfrtorch.fitting.folds import as_folded, folds
-from lfrtorch.records import Record, Start
 
 
 def record(samples: int, start: Start = "zero", skip: int = 0, period: int | None = None) -> Record:

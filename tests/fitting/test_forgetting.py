@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import lfrtorch
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
 
 
 def toggle(u: np.ndarray, x: float) -> np.ndarray:

@@ -12,7 +12,7 @@ import torch
 import lfrtorch
 from lfrtorch import InputError, LevenbergMarquardt, Record, Settings, identify
 from lfrtorch.engine.held import integrating_states
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

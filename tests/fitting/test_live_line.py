@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import lfrtorch
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine, _progress_text
 from lfrtorch.fitting.observer import LineObserver
 from lfrtorch.fitting.trainer import Progress, RestartSummary, Round
-from lfrtorch.records import Channel, Record
 
 U = np.random.default_rng(0).standard_normal(100)
 RECORD = Record(U, np.tanh(U), 10.0, outputs=(Channel("y", "m"),))

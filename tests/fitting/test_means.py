@@ -9,12 +9,12 @@ import torch
 from reference import random_cell, random_model
 
 import lfrtorch
+from lfrtorch.data.records import Start
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.model import Model
-from lfrtorch.records import Start
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

@@ -16,6 +16,8 @@ from torch.nn.utils import vector_to_parameters
 import lfrtorch
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.threads import worth_threads
+from lfrtorch.data.metrics import rmse
+from lfrtorch.data.records import Record
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.fitting import side_by_side
@@ -25,9 +27,7 @@ from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.metrics import rmse
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

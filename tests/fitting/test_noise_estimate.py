@@ -11,7 +11,7 @@ from test_extended_kalman_filter import step
 
 import lfrtorch
 from lfrtorch import NoiseCovariance
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

@@ -13,11 +13,11 @@ import torch
 from reference import normal, random_cell, random_model
 
 import lfrtorch
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Record
 from lfrtorch.engine.innovation import predictor_cell, split_predictor
 from lfrtorch.fitting.settings import Settings
-from lfrtorch.metrics import rms
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

@@ -16,6 +16,7 @@ from torch.nn.utils import parameters_to_vector
 
 from lfrtorch._support.atomic import TEMPORARY
 from lfrtorch._support.reasons import Reason
+from lfrtorch.data.records import Record, Start
 from lfrtorch.distributed import Ranks, using
 from lfrtorch.fitting import state_file, trainer
 from lfrtorch.fitting.multistart import fit
@@ -23,8 +24,7 @@ from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import Fit, FitResult, Progress
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.model import Model
-from lfrtorch.records import Record, Start
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

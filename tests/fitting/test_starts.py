@@ -11,6 +11,8 @@ from reference import random_system
 from scipy.signal import butter, lfilter
 from torch import Tensor, nn
 
+from lfrtorch.data.metrics import rmse
+from lfrtorch.data.records import Record
 from lfrtorch.fitting import nonlinear_end
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
@@ -21,9 +23,7 @@ from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.metrics import rmse
-from lfrtorch.model import Model, load
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model, load
 
 pytestmark = pytest.mark.numeric
 

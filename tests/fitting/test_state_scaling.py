@@ -13,10 +13,10 @@ from reference import measure, normal, random_cell, random_model, weights
 
 import lfrtorch
 from lfrtorch import analysis
+from lfrtorch.data.records import Record, with_past_outputs
 from lfrtorch.engine.held import integrating_states
 from lfrtorch.fitting.state_scaling import scale_states
-from lfrtorch.model import Model, state_moment
-from lfrtorch.records import Record, with_past_outputs
+from lfrtorch.model.model import Model, state_moment
 
 pytestmark = pytest.mark.numeric
 

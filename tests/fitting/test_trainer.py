@@ -22,15 +22,15 @@ from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
 from lfrtorch._support.reasons import Reason
+from lfrtorch.data.metrics import nrmse, rmse
+from lfrtorch.data.records import Record
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import EXPLOSION, Fit, Progress
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, LevenbergMarquardt, Point
 from lfrtorch.least_squares.problem import Problem
-from lfrtorch.metrics import nrmse, rmse
-from lfrtorch.model import Model, load
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model, load
 
 pytestmark = pytest.mark.numeric
 

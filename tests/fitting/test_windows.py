@@ -13,11 +13,11 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 import lfrtorch
 from lfrtorch._support.errors import InputError
+from lfrtorch.data.records import Record
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import Fit
 from lfrtorch.fitting.windows import windows
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 numeric = pytest.mark.numeric
 

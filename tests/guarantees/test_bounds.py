@@ -10,7 +10,7 @@ from reference import measure, polynomial_cell, random_cell, random_model
 
 from lfrtorch import analysis
 from lfrtorch.maps.network import Network
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

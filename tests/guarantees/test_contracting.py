@@ -8,6 +8,7 @@ import torch
 from reference import measure, normal, polynomial_cell, random_cell, random_model
 
 from lfrtorch import analysis
+from lfrtorch.data.records import Record
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.guarantees.contracting import Contracting, MarginBound
 from lfrtorch.least_squares.adam import Adam
@@ -16,8 +17,7 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import CholeskySystem
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.maps.network import Network
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

@@ -12,9 +12,9 @@ from reference import frf, measure, polynomial_cell, random_cell, random_model
 from lfrtorch import Channel, analysis
 from lfrtorch._support.types import Array
 from lfrtorch.analysis import Contraction
+from lfrtorch.data.records import Record
 from lfrtorch.maps.network import Network
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

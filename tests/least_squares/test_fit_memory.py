@@ -5,12 +5,12 @@ import pytest
 import torch
 from reference import random_cell, random_model
 
+from lfrtorch.data.records import Record
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.records import Record
 
 
 def planned(nz: int, nn: int) -> LFRCell:

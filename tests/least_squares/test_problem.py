@@ -10,13 +10,13 @@ from reference import measure, normal, random_cell, random_model
 from torch import Tensor
 from torch.testing import assert_close
 
+from lfrtorch.data.metrics import rmse
+from lfrtorch.data.records import Channel, Record, Start
 from lfrtorch.least_squares.jacobian import Jacobian
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.output_rows import OutputRows
 from lfrtorch.least_squares.problem import Problem
-from lfrtorch.metrics import rmse
-from lfrtorch.model import Model
-from lfrtorch.records import Channel, Record, Start
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

@@ -8,6 +8,7 @@ import torch
 from reference import normal, random_cell, random_model
 from torch import Tensor
 
+from lfrtorch.data.records import Record
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.bounded_system import BoundedSystem
@@ -16,8 +17,7 @@ from lfrtorch.least_squares.linear_systems import CholeskySystem, System
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.stable_states import PoleBounds, fading, largest_modulus, stabilised
 from lfrtorch.maps.network import Network
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

@@ -7,13 +7,13 @@ import torch
 from reference import measure, normal, random_cell, random_model
 from torch.testing import assert_close
 
+from lfrtorch.data.records import Record
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

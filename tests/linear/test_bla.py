@@ -13,14 +13,14 @@ import scipy.linalg
 from reference import System, random_system
 
 from lfrtorch._support.types import Array
-from lfrtorch.excitation import multisine
+from lfrtorch.data.excitation import multisine
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Channel, Record, Scaler, Start
 from lfrtorch.linear import minima
 from lfrtorch.linear.bla import estimate_bla, refined_near
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.requirements import steady_state
-from lfrtorch.metrics import rms
-from lfrtorch.records import Channel, Record, Scaler, Start
 
 pytestmark = pytest.mark.numeric
 

@@ -8,11 +8,11 @@ from reference import frf
 from scipy import signal
 
 from lfrtorch._support.types import Array, Complex
-from lfrtorch.excitation import multisine
+from lfrtorch.data.excitation import multisine
+from lfrtorch.data.records import Record
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric
 

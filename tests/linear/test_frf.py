@@ -9,9 +9,9 @@ from experiments import FS, SEEDS, check_covariance, coloured, recorded, steady,
 from reference import random_system
 
 from lfrtorch._support.types import Array
-from lfrtorch.excitation import Multisine, multisine
+from lfrtorch.data.excitation import Multisine, multisine
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.linear.frf import FRF, Method, estimate_frf
-from lfrtorch.records import Channel, Record
 
 pytestmark = pytest.mark.numeric
 

@@ -8,6 +8,7 @@ import pytest
 from scipy.signal import butter, freqz, lfilter
 
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.linear import bla
 from lfrtorch.linear.bla import estimate_bla
@@ -15,7 +16,6 @@ from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.integrators import differenced_response, whitening_pole
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import scan_orders
-from lfrtorch.records import Channel, Record
 
 pytestmark = pytest.mark.numeric
 

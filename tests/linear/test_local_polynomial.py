@@ -5,10 +5,10 @@ import pytest
 from experiments import FS, SEEDS, check_covariance, coloured, slow_system, true_frf, vec
 from reference import dlsim
 
-from lfrtorch.excitation import multisine
+from lfrtorch.data.excitation import multisine
+from lfrtorch.data.records import Record
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.local_polynomial import half_width
-from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric
 

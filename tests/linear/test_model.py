@@ -18,12 +18,12 @@ from reference import System, normal, random_cell, random_model, random_system
 
 import lfrtorch
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Channel, Record, Scaler
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.linear.balancing import balancing
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.resolvent import frequency_response
-from lfrtorch.model import Model
-from lfrtorch.records import Channel, Record, Scaler
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
+from lfrtorch.data.records import Channel, Record, Start
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.modes import shares, without_slow_minor_modes
-from lfrtorch.records import Channel, Record, Start
 
 pytestmark = pytest.mark.numeric
 

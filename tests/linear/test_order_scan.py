@@ -11,13 +11,13 @@ from reference import System, random_system
 from scipy.signal import lfilter
 
 from lfrtorch._support.errors import InputError
+from lfrtorch.data.records import Channel, Record, Start
 from lfrtorch.linear import order_fits, order_scan
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.order_scan import OrderScan, memory_of, scan_orders
 from lfrtorch.linear.subspace import SpectralSubspace
-from lfrtorch.records import Channel, Record, Start
 
 pytestmark = pytest.mark.numeric
 

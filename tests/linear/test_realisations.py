@@ -6,10 +6,10 @@ from experiments import FS, coloured, recorded, steady
 from reference import random_system
 
 from lfrtorch._support.types import Array
-from lfrtorch.excitation import multisine
+from lfrtorch.data.excitation import multisine
+from lfrtorch.data.records import Record
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.realisations import delay
-from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from lfrtorch.data.records import Record
 from lfrtorch.linear.record_start import StartTrial, try_starts
-from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric
 

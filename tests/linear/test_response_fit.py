@@ -10,6 +10,7 @@ import torch
 from reference import System, random_system, refined
 
 from lfrtorch._support.types import Array, Complex
+from lfrtorch.data.records import Channel, NormalisedRecord, Record
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.resolvent import frequency_response
@@ -19,7 +20,6 @@ from lfrtorch.linear.spectral_data import (
     spectral_data_of_records,
     spectral_data_of_response,
 )
-from lfrtorch.records import Channel, NormalisedRecord, Record
 
 pytestmark = pytest.mark.numeric
 

@@ -10,8 +10,8 @@ import scipy.linalg
 from reference import System, random_system, refined
 
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import NormalisedRecord, Record
 from lfrtorch.linear.signal_fit import OBSERVERS, SignalFit
-from lfrtorch.records import NormalisedRecord, Record
 
 pytestmark = pytest.mark.numeric
 

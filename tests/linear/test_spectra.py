@@ -5,9 +5,9 @@ import pytest
 from experiments import FS, recorded, steady, true_frf
 from reference import dlsim, random_system
 
-from lfrtorch.excitation import multisine
+from lfrtorch.data.excitation import multisine
+from lfrtorch.data.records import Record
 from lfrtorch.linear.frf import estimate_frf
-from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric
 

@@ -14,7 +14,7 @@ from reference import measure, move, random_cell, random_model
 import lfrtorch
 from lfrtorch._support.types import Array
 from lfrtorch.analysis import linearise
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

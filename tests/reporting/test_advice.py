@@ -13,7 +13,7 @@ import pytest
 
 import lfrtorch
 from lfrtorch.cli.composition import composed, spelt
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
 from lfrtorch.reporting import advice
 from lfrtorch.reporting.advice import advise
 from lfrtorch.reporting.diagnosis import Evidence

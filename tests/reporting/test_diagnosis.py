@@ -10,8 +10,8 @@ import scipy.signal
 
 import lfrtorch
 from lfrtorch._support.reasons import Reason
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.fitting.trainer import FitResult, Progress, RestartSummary
-from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import advice
 from lfrtorch.reporting.advice import advise
 from lfrtorch.reporting.diagnosis import (

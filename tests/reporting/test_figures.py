@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import lfrtorch
-from lfrtorch.dataset import Dataset
-from lfrtorch.records import Channel, Record
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.reporting import figures, plots
 from lfrtorch.reporting.evaluation import Response
 

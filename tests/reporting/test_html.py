@@ -15,9 +15,9 @@ import torch
 import lfrtorch
 from lfrtorch._support.tables import number
 from lfrtorch.analysis.linearisation import poles_at_rest
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.data.dataset import Dataset, Published
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import html as html_report
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.advice import Advice

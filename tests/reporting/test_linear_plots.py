@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import lfrtorch
+from lfrtorch.data.records import Channel
 from lfrtorch.linear.frf import Distortion, Level
-from lfrtorch.records import Channel
 from lfrtorch.reporting import linear_plots
 
 pytestmark = pytest.mark.numeric

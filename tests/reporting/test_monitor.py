@@ -12,8 +12,8 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from tensorboard.summary.writer import event_file_writer
 
 import lfrtorch
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.fitting.trainer import Progress, RestartSummary, Round
-from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import plots
 from lfrtorch.reporting.monitor import Checkpoint, TensorBoard
 

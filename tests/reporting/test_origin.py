@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
 from lfrtorch.reporting.origin import checksum, git_state
 
 U = np.random.default_rng(0).standard_normal(50)

@@ -6,8 +6,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle, StepPatch
 
 from lfrtorch.analysis.confidence_bands import Band
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.fitting.trainer import Progress
-from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import plots
 
 pytestmark = pytest.mark.numeric

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import lfrtorch
-from lfrtorch.dataset import Dataset, Published
-from lfrtorch.records import Channel, Record
+from lfrtorch.data.dataset import Dataset, Published
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.evaluation import Evaluation, Response
 from lfrtorch.reporting.score_columns import of_samples, use_of

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from lfrtorch._support.reasons import Reason
+from lfrtorch.data.metrics import rms
+from lfrtorch.data.records import Record
 from lfrtorch.fitting.trainer import FitResult
-from lfrtorch.metrics import rms
-from lfrtorch.records import Record
 from lfrtorch.reporting import verdict
 from lfrtorch.reporting.evaluation import CROSS, Response
 from lfrtorch.reporting.verdict import Kind, Verdict

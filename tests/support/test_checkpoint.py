@@ -17,10 +17,10 @@ from torch import Tensor, nn
 
 import lfrtorch
 from lfrtorch._support import checkpoint
+from lfrtorch.data.records import Channel
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.model import Model, load
-from lfrtorch.records import Channel
+from lfrtorch.model.model import Model, load
 
 U = np.random.default_rng(0).normal(size=(50, 2))
 

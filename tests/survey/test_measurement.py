@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from lfrtorch import multisine
-from lfrtorch.records import Channel
+from lfrtorch.data.records import Channel
 from lfrtorch.survey.measurement import survey_measurement
 from lfrtorch.survey.signal import longest_run
 

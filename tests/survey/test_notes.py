@@ -10,8 +10,8 @@ from scipy.io import loadmat
 from scipy.signal import butter, lfilter, sosfilt
 
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.datasets import boucwen, parwh, silverbox, wiener_hammerstein
-from lfrtorch.records import Channel, Record
 from lfrtorch.survey.measurement import survey_measurement
 from lfrtorch.survey.notes import examine, notes_on
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import chirp, lfilter
 
 from lfrtorch._support.types import Array
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
 from lfrtorch.survey.notes import notes_on
 from lfrtorch.survey.outliers import input_outliers, output_outliers
 

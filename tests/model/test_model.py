@@ -16,6 +16,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lfrtorch._support.tables import UNKNOWN
+from lfrtorch.data.metrics import rmse
+from lfrtorch.data.records import Channel, Record
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.held import no_feedthrough, structure
 from lfrtorch.engine.newton import newton_states
@@ -25,9 +27,7 @@ from lfrtorch.least_squares.problem import Problem
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.metrics import rmse
-from lfrtorch.model import Model, load
-from lfrtorch.records import Channel, Record
+from lfrtorch.model.model import Model, load
 
 pytestmark = pytest.mark.numeric
 

@@ -12,13 +12,13 @@ from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number
 from lfrtorch._support.types import Array
+from lfrtorch.data.metrics import BlockScores, rmse
+from lfrtorch.data.periods import find_period, find_transient
+from lfrtorch.data.records import Record
+from lfrtorch.data.score_window import PART, WINDOW, score_window, warm_up
 from lfrtorch.files.stream import Block, FileStream
 from lfrtorch.files.writer import table_writer
-from lfrtorch.metrics import BlockScores, rmse
-from lfrtorch.model import Model, simulate_blocks
-from lfrtorch.periods import find_period, find_transient
-from lfrtorch.records import Record
-from lfrtorch.score_window import PART, WINDOW, score_window, warm_up
+from lfrtorch.model.model import Model, simulate_blocks
 
 BEGINNING = 100
 """Samples in which the transient of a wrong start state would be seen."""

@@ -22,7 +22,19 @@ from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.frames import check_index, columns_of, framed, is_frame, places_of
 from lfrtorch._support.old_checkpoints import SCALING, innermost, of_today
 from lfrtorch._support.types import Array
-from lfrtorch.data_reach import Cloud, DataReach
+from lfrtorch.data.records import (
+    Channel,
+    NormalisedRecord,
+    Record,
+    Scaler,
+    Start,
+    as_records,
+    as_signal,
+    check_rate,
+    check_start,
+    described_channels,
+    with_past_outputs,
+)
 from lfrtorch.engine import held
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, levels, listed, system_lines
@@ -40,28 +52,16 @@ from lfrtorch.engine.linearised import static_slope
 from lfrtorch.engine.operating_point import double, equilibrium, linear_part, linearised_at
 from lfrtorch.engine.resampling import resampled_cell
 from lfrtorch.engine.simulation import Trajectory, simulate
-from lfrtorch.extended_kalman_filter import (
+from lfrtorch.maps.descriptions import foreign, made
+from lfrtorch.maps.static_map import StaticMap
+from lfrtorch.model.data_reach import Cloud, DataReach
+from lfrtorch.model.extended_kalman_filter import (
     ExtendedKalmanFilter,
     NoiseCovariance,
     inside_limits,
     with_variances,
 )
-from lfrtorch.maps.descriptions import foreign, made
-from lfrtorch.maps.static_map import StaticMap
-from lfrtorch.records import (
-    Channel,
-    NormalisedRecord,
-    Record,
-    Scaler,
-    Start,
-    as_records,
-    as_signal,
-    check_rate,
-    check_start,
-    described_channels,
-    with_past_outputs,
-)
-from lfrtorch.state_observer import StateObserver, SteadyGainObserver
+from lfrtorch.model.state_observer import StateObserver, SteadyGainObserver
 
 NO_OBSERVER = (
     "this model has no innovation gain K: give noise=lfrtorch.NoiseCovariance(Q, R) for a Kalman "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lfrtorch.known import Known, Parameter, State
+from lfrtorch.model.known import Known, Parameter, State
 
 _EMPTY = 1e-3
 """Least level whose outflow has a slope, V: that of a root is infinite at 0."""

@@ -12,13 +12,13 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.frames import columns_of, is_frame
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
-from lfrtorch.dataset import Dataset
+from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record, Start
 from lfrtorch.files.split import cut
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.job import identify
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.records import Record, Start
 
 base = imported("sklearn.base", "sklearn")
 validation = imported("sklearn.utils.validation", "sklearn")

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from lfrtorch.metrics import BlockScores, nrmse, rms, rmse, rmse_by_output
-from lfrtorch.records import Record, Scaler
+from lfrtorch.data.metrics import BlockScores, nrmse, rms, rmse, rmse_by_output
+from lfrtorch.data.records import Record, Scaler
 
 pytestmark = pytest.mark.numeric
 

@@ -6,8 +6,8 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lfrtorch.excitation import multisine
-from lfrtorch.periods import find_period, find_transient
+from lfrtorch.data.excitation import multisine
+from lfrtorch.data.periods import find_period, find_transient
 
 pytestmark = pytest.mark.numeric
 

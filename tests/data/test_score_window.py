@@ -10,8 +10,8 @@ from experiments import cut_from, noise_of, resonance
 
 import lfrtorch
 from lfrtorch import Dataset, LinearModel, Record
-from lfrtorch.model import state_moment
-from lfrtorch.score_window import score_window, with_window
+from lfrtorch.data.score_window import score_window, with_window
+from lfrtorch.model.model import state_moment
 
 INTEGRATOR = replace(resonance(0.5, 1.0), A=np.array([[1.0, 0.3], [0.0, 0.6]]))
 

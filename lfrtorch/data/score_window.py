@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
 
 WINDOW = 50
 """Samples that a start is fitted to, and a score leaves out."""

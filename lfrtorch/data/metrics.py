@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
 
 
 def rms(signal: ArrayLike, axis: int | None = None) -> Array:

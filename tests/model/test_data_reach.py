@@ -10,8 +10,8 @@ from reference import measure, random_cell, random_model
 
 import lfrtorch
 from lfrtorch.analysis import canonical, linearise, trim
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.data.records import Record
+from lfrtorch.model.model import Model
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ from lfrtorch import NoiseCovariance
 from lfrtorch._support.types import Array
 from lfrtorch.engine.kalman_kernel import correct, propagate
 from lfrtorch.fitting.state_scaling import scale_states
-from lfrtorch.model import Model
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

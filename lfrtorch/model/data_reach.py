@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from lfrtorch._support.tables import quantities
 from lfrtorch._support.types import Array
-from lfrtorch.records import Channel
+from lfrtorch.data.records import Channel
 
 FARTHEST = 0.99
 """Part of the samples whose surprise is below 1."""

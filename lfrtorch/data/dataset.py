@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.records import Record, signals
-from lfrtorch.score_window import with_window
+from lfrtorch.data.records import Record, signals
+from lfrtorch.data.score_window import with_window
 
 LISTED = 3
 """Most records of a use that a printed dataset lists."""

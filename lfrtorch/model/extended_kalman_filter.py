@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Channel, Record, Scaler
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.kalman_kernel import (
     advance_sample,
@@ -23,8 +24,7 @@ from lfrtorch.engine.kalman_kernel import (
     propagate,
 )
 from lfrtorch.engine.linearised import linearise
-from lfrtorch.records import Channel, Record, Scaler
-from lfrtorch.state_observer import StateObserver
+from lfrtorch.model.state_observer import StateObserver
 
 _ROUNDING = 1e-9  # part of the largest eigenvalue by which a negative one may be rounding
 

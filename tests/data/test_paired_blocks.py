@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from lfrtorch.paired_blocks import (
+from lfrtorch.data.paired_blocks import (
     BLOCKS,
     Judge,
     blocked_mean,

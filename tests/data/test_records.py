@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from lfrtorch.fitting.first_fit import part_of
-from lfrtorch.fitting.refit import all_records
-from lfrtorch.fitting.windows import windows, windows_from_outputs
-from lfrtorch.records import (
+from lfrtorch.data.records import (
     Channel,
     Record,
     Scaler,
@@ -19,6 +16,9 @@ from lfrtorch.records import (
     with_past_outputs,
     without_coordinates,
 )
+from lfrtorch.fitting.first_fit import part_of
+from lfrtorch.fitting.refit import all_records
+from lfrtorch.fitting.windows import windows, windows_from_outputs
 
 U, Y = np.linspace(-1, 1, 20).reshape(10, 2), np.linspace(3, 4, 10)
 

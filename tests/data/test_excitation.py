@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lfrtorch
-from lfrtorch.excitation import Multisine, multisine
+from lfrtorch.data.excitation import Multisine, multisine
 
 pytestmark = pytest.mark.numeric
 

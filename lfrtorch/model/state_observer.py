@@ -17,9 +17,9 @@ from torch import Tensor
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.data.records import Channel, Scaler
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.simulation_kernel import simulate_records
-from lfrtorch.records import Channel, Scaler
 
 
 class StateObserver(ABC):

@@ -1,0 +1,1 @@
+"""Records, by use, and their scores."""

@@ -1,0 +1,1 @@
+"""An LFR with its scaling, rate and channels, and its states online."""

@@ -1,0 +1,1 @@
+"""Models on new data."""
