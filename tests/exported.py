@@ -166,3 +166,10 @@ def jacobians(model: Model, x: Array, u: Array) -> list[Array]:
     """dx+/dx, dx+/du, dy/dx and dy/du by torch."""
     by = jacrev(lambda x, u: cell_step(model, x, u), argnums=(0, 1))
     return [one.detach().numpy() for each in by(torch.tensor(x), torch.tensor(u)) for one in each]
+
+
+def step(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
+    """x+ and y, physical units."""
+    with torch.no_grad():
+        x_next, y = cell_step(model, torch.tensor(x), torch.tensor(u))
+    return x_next.numpy(), y.numpy()

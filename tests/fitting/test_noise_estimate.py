@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exported import step
 from reference import normal, random_cell, random_model
-from test_extended_kalman_filter import step
 
 import lfrtorch
 from lfrtorch import NoiseCovariance

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy
 import torch
-from exported import MODELS, cell_step, inputs, jacobians, measured_with_gaps, some_noise
+from exported import MODELS, inputs, jacobians, measured_with_gaps, some_noise, step
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import (
@@ -32,13 +32,6 @@ from lfrtorch.fitting.state_scaling import scale_states
 from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
-
-
-def step(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
-    """x+ and y, physical units."""
-    with torch.no_grad():
-        x_next, y = cell_step(model, torch.tensor(x), torch.tensor(u))
-    return x_next.numpy(), y.numpy()
 
 
 def textbook(
