@@ -54,7 +54,7 @@ class Gradients:
         _, (self.trajectory,) = errors.evaluate(errors.first_theta())
         group: RecordGroup = errors.groups[0].counted(self.trajectory.y)
         self.group = group
-        periodic, self.estimated = group.start == "periodic", group.start == "estimated"
+        periodic, self.estimated = group.start.periodic, group.start.fitted
         self._along = Linearisation(model.lfr.cell, group.u, self.trajectory, periodic=periodic)
         self._hold = hold
         self._held: list[tuple[slice, Tensor]] = []

@@ -17,7 +17,7 @@ from torch.nn.functional import pad
 
 from lfrtorch._support.types import Array
 from lfrtorch.data.records import NormalisedRecord, Record, Start
-from lfrtorch.engine.initial_state import measured_start
+from lfrtorch.engine.record_starts import STARTS, AtRest
 from lfrtorch.engine.weights import Weights
 
 EVERY = slice(None)
@@ -29,13 +29,13 @@ class RecordGroup:
 
     u: Float[Tensor, "R T nu"]
     y: Float[Tensor, "R T ny"]
-    x0: Float[Tensor, "R nx"] | None
-    estimated: Int[Tensor, " R"] | None  # numbers of the estimated initial states
+    x0: Float[Tensor, "R nx"] | None  # at every θ
+    estimated: Int[Tensor, " R"] | None  # numbers of first states that are parameters
     scored: Float[Tensor, "R T ny"]
     weight: Float[Tensor, "R m ny"]  # of samples, or of spectral lines, m = T // 2 + 1
     start_weight: Float[Tensor, "R T ny"] | None  # estimates the initial state of a given model
     spectral: bool
-    start: Start
+    start: AtRest
     # Which way an output may be beyond a limit of its sensor: 1, -1 or 0.
     beyond: Float[Tensor, "R T ny"] | None = None
     limits: Float[Tensor, "R 2 1 ny"] | None = None
@@ -98,7 +98,7 @@ def group_records(
     members: dict[tuple[int, Start, bool], list[NormalisedRecord]] = defaultdict(list)
     estimated: dict[tuple[int, Start, bool], list[int]] = defaultdict(list)
     count = itertools.count()
-    numbers = [next(count) if each.record.start == "estimated" else 0 for each in records]
+    numbers = [next(count) if STARTS[each.record.start].fitted else 0 for each in records]
     for each, number in list(zip(records, numbers, strict=True))[own]:
         kind = each.record.samples, each.record.start, each.record.line_weight is not None
         members[kind].append(each)
@@ -108,28 +108,20 @@ def group_records(
     def stacked(arrays: list[NDArray]) -> Tensor:
         return torch.tensor(np.stack(arrays)).to(model.flat)
 
-    def start_states(start: Start, group: Sequence[NormalisedRecord]) -> Tensor | None:
-        if start == "given":
-            return stacked([each.record.x0 for each in group if each.record.x0 is not None])
-        if start == "measured":  # the same at every θ: the output's equation is not fitted
-            first = [(each.u[0], each.y[0]) for each in group]
-            return measured_start(model, *(stacked(list(s)) for s in zip(*first, strict=True)))
-        return None
-
     for kind, group in members.items():
-        _, start, spectral = kind
-        physical = [each.record for each in group]
+        _, name, spectral = kind
+        start, physical = STARTS[name], [each.record for each in group]
+        u, y = stacked([each.u for each in group]), stacked([each.y for each in group])
+        own_x0 = [record.x0 for record in physical if record.x0 is not None]
         groups.append(
             RecordGroup(
-                u=stacked([each.u for each in group]),
-                y=stacked([each.y for each in group]),
-                x0=start_states(start, group),
-                estimated=torch.tensor(estimated[kind]) if start == "estimated" else None,
+                u=u,
+                y=y,
+                x0=start.known(model, u, y, stacked(own_x0) if own_x0 else None),
+                estimated=torch.tensor(estimated[kind]) if start.fitted else None,
                 scored=stacked([r.scored for r in physical]),
                 weight=stacked([_factors(r) for r in physical]),
-                start_weight=stacked([r.start_factors for r in physical])
-                if start == "estimated"
-                else None,
+                start_weight=stacked([r.start_factors for r in physical]) if start.fitted else None,
                 spectral=spectral,
                 start=start,
                 beyond=stacked([r.beyond for r in physical])

@@ -13,9 +13,9 @@ from lfrtorch._support.threads import has_kernels
 from lfrtorch._support.types import Array
 from lfrtorch.data.records import NormalisedRecord
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.initial_state import estimated_start, start_from_beginning
+from lfrtorch.engine.record_starts import STARTS
 from lfrtorch.engine.sensitivity import Linearisation
-from lfrtorch.engine.simulation import Trajectory, simulate, steady_state
+from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.engine.weights import Weights
 from lfrtorch.least_squares.output_rows import Memory, OutputRows
 from lfrtorch.least_squares.record_groups import EVERY, group_records
@@ -90,7 +90,7 @@ class SimulationErrors:
         cell.check()
         self._y_scale = y_scale
         self._solved = solve_initial_states
-        estimated = sum(each.record.start == "estimated" for each in records)
+        estimated = sum(STARTS[each.record.start].fitted for each in records)
         self.parameters = Parameters(cell, 0 if solve_initial_states else estimated)
         start = self.parameters.weights(self.parameters.start)
         self.groups = group_records(records, start, own)
@@ -114,8 +114,7 @@ class SimulationErrors:
             x0 = group.estimated if self.parameters.states else None
             if x0 is not None:
                 x0 = own + W.nx * x0.unsqueeze(1) + torch.arange(W.nx)
-            periodic = group.start == "periodic"
-            linearisation = Linearisation(W, group.u, trajectory, periodic=periodic)
+            linearisation = Linearisation(W, group.u, trajectory, periodic=group.start.periodic)
             counted = group.counted(trajectory.y)
             rows.append(OutputRows(counted, linearisation, x0, self._memory, eliminate=eliminate))
         return rows
@@ -134,16 +133,13 @@ class SimulationErrors:
         W, found = self.parameters.weights(theta), []
         for i, group in enumerate(self.groups):
             states = None if near is None else near[i].x
-            if group.start == "periodic":
-                found.append(steady_state(W, group.u, states))
-                continue
             x0 = group.x0
             if group.start_weight is not None and self._solved:
                 first = None if states is None else states[:, 0]
-                x0 = estimated_start(W, group.u, group.y, group.start_weight, first)
+                x0 = group.start.solved(W, group.u, group.y, group.start_weight, first)
             elif group.estimated is not None:
                 x0 = self.parameters.initial_states(theta)[group.estimated]
-            found.append(simulate(W, group.u, x0, guess=states))
+            found.append(group.start.trajectory(W, group.u, x0, states))
         return tuple(found)
 
     def part(self, chosen: Sequence[Int[Tensor, " n"]]) -> SimulationErrors:
@@ -165,7 +161,7 @@ class SimulationErrors:
                 weight = group.weight
                 if group.beyond is not None:
                     weight = weight * (group.beyond == 0)
-                states[group.estimated] = start_from_beginning(W, group.u, group.y, weight)
+                states[group.estimated] = group.start.guess(W, group.u, group.y, weight)
         return torch.cat([start, states.flatten()])
 
     def release(self) -> None:

@@ -45,11 +45,12 @@ from lfrtorch.engine.disturbance import (
     tells_apart,
 )
 from lfrtorch.engine.gauge_directions import free_directions
-from lfrtorch.engine.initial_state import estimated_start, measured_start
+from lfrtorch.engine.initial_state import measured_start
 from lfrtorch.engine.innovation import predictor_cell, split_predictor
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import static_slope
 from lfrtorch.engine.operating_point import double, equilibrium, linear_part, linearised_at
+from lfrtorch.engine.record_starts import begun
 from lfrtorch.engine.resampling import resampled_cell
 from lfrtorch.engine.simulation import Trajectory, simulate
 from lfrtorch.maps.descriptions import foreign, made
@@ -87,11 +88,8 @@ def simulate_record(lfr: LFR, normalised: NormalisedRecord, start: Start) -> Tra
     like, record = lfr.cell.A, normalised.record
     signals = normalised.u, normalised.y, record.start_factors
     u, y, weight = (torch.tensor(signal).to(like).unsqueeze(0) for signal in signals)
-    if start == "estimated":
-        return lfr.trajectory(u, estimated_start(lfr.cell, u, y, weight))
-    if start == "measured":
-        return lfr.trajectory(u, measured_start(lfr.cell, u[:, 0], y[:, 0]))
-    return lfr.trajectory(u, None, start)
+    lfr.cell.check()
+    return begun(start, lfr.cell, u, y, weight)
 
 
 class Resampled(NamedTuple):
