@@ -13,7 +13,7 @@ from torch.nn import Module
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
-from lfrtorch.engine.cell import LFRCell, Matrices
+from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.maps.direct_sum import DirectSum
 from lfrtorch.model.model import Model
@@ -89,7 +89,7 @@ def _beside(cells: Sequence[LFRCell]) -> Module | None:
 
 
 def _held_beside(cells: Sequence[LFRCell], whole: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Masks of the mean of cells; zeros between two blocks are held as the blocks themselves are.
+    """Masks of the mean of cells; where a block has entries that are held, blocks stay apart.
 
     Otherwise a fit of the mean would lead w of one model to z of another past a structure.
     """
@@ -101,12 +101,8 @@ def _held_beside(cells: Sequence[LFRCell], whole: Mapping[str, Tensor]) -> dict[
         ]
         if name == "Dyu":
             found[name] = torch.stack(masks).all(dim=0)
-        elif name in ("Bu", "Dzu"):
-            found[name] = torch.cat(masks)
-        elif name in ("Cy", "Dyw"):
-            found[name] = torch.cat(masks, dim=1)
-        elif name in Matrices._fields and len({mask.shape for mask in masks}) == 1:
-            found[name] = torch.stack(masks).any(dim=0).repeat(len(cells), len(cells))
+        elif name in ("Bu", "Dzu", "Cy", "Dyw"):
+            found[name] = torch.cat(masks, dim=int(name in ("Cy", "Dyw")))
         else:
             found[name] = ~torch.block_diag(*(~mask for mask in masks))
     return {name: mask for name, mask in found.items() if mask.shape == whole[name].shape}

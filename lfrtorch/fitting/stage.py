@@ -5,13 +5,18 @@ A fit says when it is made, to which data, by which trainer, and what is kept of
     class Reweighted(Stage):
         name = "the fit to records weighted by their errors"
 
+        def models(self, job):
+            return [job.result.model]
+
         def data(self, job):
             return Data([replace(r, weight=...) for r in job.dataset.train])
 
         def keep(self, job, result):
-            return replace(job, models=[result.model])
+            return replace(job, result=replace(job.result, model=result.model))
 
-Others override ``run``. ``stages.STAGES`` has them all in their order, and asks no more of them.
+A stage before ``WholeFit`` leaves ``models``, where that begins; one after it goes on from
+``result``. Others override ``run``. ``stages.STAGES`` has them all in their order, and asks no more
+of them.
 """
 
 from __future__ import annotations
@@ -102,6 +107,10 @@ class Stage:
         """Whether it takes part."""
         return True
 
+    def models(self, job: Job) -> Sequence[Model]:
+        """Where it starts."""
+        return job.models
+
     def data(self, job: Job) -> Data:
         """What it fits."""
         return Data.of(job.dataset)
@@ -120,17 +129,21 @@ class Stage:
 
     def run(self, job: Job) -> Job:
         """The job after the stage."""
-        monitor = job.observer.searching()
+        # One that is cut short leaves the whole fit, if there is one, with that for its reason.
+        monitor, models = job.observer.searching(), self.models(job)
         result = job.fit(
-            job.models,
+            models,
             self.data(job),
             trainer=self.trainer(job),
-            monitors=None if monitor is None else [[monitor]] * len(job.models),
+            monitors=None if monitor is None else [[monitor]] * len(models),
             **self.options(job),
         )
-        if result.reason in CUT_SHORT:
+        if result.reason not in CUT_SHORT:
+            return self.keep(job, result)
+        if job.result is None:
             raise StoppedError(f"stopped during {self.name}")
-        return self.keep(job, result)
+        whole = replace(job.result, reason=result.reason, detail=result.detail)
+        return replace(job, result=whole)
 
 
 def best_start(job: Job, result: FitResult) -> tuple[Settings, list[Model]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,11 +33,11 @@ class Reweighted(Stage):
     def trainer(self, job: Job) -> Trainer:
         return LevenbergMarquardt(max_iter=25)
 
+    def models(self, job: Job) -> list[lfrtorch.Model]:
+        return [job.result.model]
+
     def keep(self, job: Job, result: FitResult) -> Job:
         return replace(job, result=replace(job.result, model=result.model))
-
-    def run(self, job: Job) -> Job:
-        return super().run(replace(job, models=[job.result.model]))
 
 
 def records() -> list[Record]:
@@ -71,18 +72,39 @@ def test_a_stage_is_added_by_one_line(monkeypatch: pytest.MonkeyPatch):
     assert weighted < 0.9 * alike
 
 
-def test_a_stage_that_is_stopped_says_which(monkeypatch: pytest.MonkeyPatch):
-    asked: list[bool] = []
+class Cut(LevenbergMarquardt):
+    """A search that is interrupted at its second step."""
 
-    class Stopped(Reweighted):
-        def run(self, job: Job) -> Job:
-            asked.append(True)
-            return super().run(replace(job, stop=lambda: True))
+    def step(self, problem: Any, state: Any) -> Any:
+        if state.iteration:
+            raise KeyboardInterrupt
+        return super().step(problem, state)
 
-    monkeypatch.setattr("lfrtorch.job.STAGES", after_the_fit(Stopped()))
-    with pytest.raises(StoppedError, match="stopped"):
+
+class Interrupted(Reweighted):
+    def trainer(self, job: Job) -> Trainer:
+        return Cut(max_iter=4)
+
+
+def test_a_stage_that_is_cut_short_leaves_the_whole_fit(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("lfrtorch.job.STAGES", after_the_fit(Interrupted()))
+    run = identified()
+    assert run.fit.reason == lfrtorch.Reason.INTERRUPTED
+    assert run.fit.iterations == 25
+
+
+def test_a_stage_that_is_cut_short_before_the_whole_fit_says_which(monkeypatch: pytest.MonkeyPatch):
+    class Early(Interrupted):
+        def models(self, job: Job) -> list[lfrtorch.Model]:
+            return [*job.models]
+
+        def data(self, job: Job) -> Data:
+            return Data(job.dataset.train)
+
+    at = next(i for i, one in enumerate(STAGES) if isinstance(one, WholeFit))
+    monkeypatch.setattr("lfrtorch.job.STAGES", (*STAGES[:at], Early(), *STAGES[at:]))
+    with pytest.raises(StoppedError, match="stopped during the fit to weighted records"):
         identified()
-    assert asked
 
 
 def test_a_stage_that_keeps_nothing_is_an_error():
