@@ -42,15 +42,9 @@ class AtRest:
         """First states that a model and the outputs tell, from some nearby; None if known."""
         return None
 
-    def guess(
-        self,
-        model: Numbers,
-        u: Float[Tensor, "R T nu"],
-        y: Float[Tensor, "R T ny"],
-        weight: Float[Tensor, "R T ny"],
-    ) -> Float[Tensor, "R nx"]:
+    def guess(self, model: Numbers, u: Tensor, y: Tensor, weight: Tensor) -> Tensor:
         """Where a fit begins with first states that are parameters."""
-        return u.new_zeros(len(u), model.nx)
+        raise NotImplementedError
 
     def trajectory(
         self,

@@ -75,8 +75,9 @@ class Problem(LeastSquares):
         """The simulation errors of a model over records of its channels and rate."""
         # ``longest``: samples of the longest record before they were cut into windows, which
         # ``"stable"`` goes by.
-        errors = errors_of(model, records)
-        longest = longest or max(record.samples for record in as_records(records))
+        data = as_records(records)
+        errors = errors_of(model, data, own=cls._share(model, data))
+        longest = longest or max(record.samples for record in data)
         kept = guarantee_of(guarantee, model.lfr.cell, longest)
         return cls(model.lfr, errors, ridge=ridge, guarantee=kept)
 
@@ -101,6 +102,10 @@ class Problem(LeastSquares):
     def of_own_records(self, state: State) -> State:
         """A search's state with the residual of the records that this process has."""
         return state
+
+    @classmethod
+    def _share(cls, model: Model, records: Sequence[Record]) -> slice:
+        return EVERY
 
     def _first_theta(self) -> Float[Tensor, " P"]:
         return self.errors.first_theta()

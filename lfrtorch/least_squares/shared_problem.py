@@ -8,19 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._support.errors import InputError
-from lfrtorch.data.records import Record, as_records
+from lfrtorch.data.records import Record
 from lfrtorch.distributed import Ranks, current
-from lfrtorch.least_squares.guarantee import Name, guarantee_of
 from lfrtorch.least_squares.jacobian import Jacobian
 from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator, System
-from lfrtorch.least_squares.problem import Problem, errors_of
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.model.model import Model
 
@@ -35,33 +34,22 @@ class SharedProblem(Problem):
     """One process's part of a problem."""
 
     shared = True
-    _ranks: Ranks
+
+    def __init__(self, *parts: Any, **options: Any) -> None:
+        self._ranks = current()
+        super().__init__(*parts, **options)
 
     @classmethod
-    def of(
-        cls,
-        model: Model,
-        records: Record | Sequence[Record],
-        *,
-        ridge: Ridge = 0.0,
-        guarantee: Name | None = None,
-        longest: int | None = None,
-    ) -> Self:
-        """The simulation errors of the first process's model over the records of all."""
-        ranks, data = current(), as_records(records)
-        if len(data) < ranks.world:
+    def _share(cls, model: Model, records: Sequence[Record]) -> slice:
+        """The records of this process; all begin with the weights of the first one's model."""
+        ranks = current()
+        if len(records) < ranks.world:
             raise InputError(
-                f"{ranks.world} processes share {len(data)} record(s); each needs one: start "
+                f"{ranks.world} processes share {len(records)} record(s); each needs one: start "
                 "fewer processes, or cut the data into more records."
             )
         same_weights([model])
-        found = cls.__new__(cls)
-        found._ranks = ranks
-        errors = errors_of(model, data, own=slice(ranks.rank, None, ranks.world))
-        longest = longest or max(record.samples for record in data)
-        kept = guarantee_of(guarantee, model.lfr.cell, longest)
-        found.__init__(model.lfr, errors, ridge=ridge, guarantee=kept)
-        return found
+        return slice(ranks.rank, None, ranks.world)
 
     def total(self, part: Tensor) -> Tensor:
         """The sum of the parts of all processes."""
