@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import cached_property, partial
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -26,7 +26,9 @@ from lfrtorch.least_squares.record_groups import EVERY
 from lfrtorch.least_squares.ridge import Ridge, RidgePenalty, ridge_by_entry
 from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.least_squares.term import Term
-from lfrtorch.model.model import Model
+
+if TYPE_CHECKING:
+    from lfrtorch.model.model import Model
 
 State = TypeVar("State")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
@@ -21,7 +21,9 @@ from lfrtorch.least_squares.jacobian import Jacobian
 from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator, System
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
-from lfrtorch.model.model import Model
+
+if TYPE_CHECKING:
+    from lfrtorch.model.model import Model
 
 
 def problem_of(model: Model, records: Record | Sequence[Record], **options: Any) -> Problem:
