@@ -28,7 +28,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.cell import LFRCell, Matrices
 from lfrtorch.engine.held import past_outputs
 
 TIED = {"A": "Cy", "Bu": "Dyu", "Bw": "Dyw"}
@@ -84,4 +84,6 @@ def _like(cell: LFRCell, nu: int) -> LFRCell:
     found = LFRCell(*sizes, deepcopy(cell.static), device=A.device, dtype=A.dtype, random=False)
     for name in ("Cz", "Cy", "Dyw", "state_covariance"):
         getattr(found, name).copy_(getattr(cell, name))
+    for name in {*Matrices._fields} - {*TIED}:  # frozen ones stay so
+        found.get_parameter(name).requires_grad_(cell.get_parameter(name).requires_grad)
     return found

@@ -13,7 +13,7 @@ from torch.nn import Module
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
-from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.cell import LFRCell, Matrices
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.maps.direct_sum import DirectSum
 from lfrtorch.model.model import Model
@@ -74,6 +74,9 @@ def mean_model(models: Sequence[Model]) -> Model:
         cell.Cy.copy_(beside(lambda c: c.Cy))
         cell.Dyw.copy_(beside(lambda c: c.Dyw))
         cell.Dyu.copy_(torch.stack([c.Dyu for c in cells]).mean(dim=0))
+    for name in Matrices._fields:  # frozen ones stay so
+        frozen = not any(c.get_parameter(name).requires_grad for c in cells)
+        cell.get_parameter(name).requires_grad_(not frozen)
     cell.held = _held_beside(cells, dict(cell.named_parameters()))
     return replace(first, lfr=LFR(cell), K=None)  # gains of models do not make one of their mean
 

@@ -214,3 +214,19 @@ def test_what_stands_beside_known_equations(options: dict[str, Any]):
     if "z_feedthrough" in options:
         assert not cell.Dzu[2:].any()
         assert cell.Dzu[1, 0].item() == 1.0
+
+
+def test_a_frozen_matrix_stays_so_in_predictions_and_means():
+    bla = lfrtorch.estimate_bla(saturating(), nx=2, refine="prediction")
+    models = [lfrtorch.initialise(bla, saturating(), nz=1, nw=1, nn=3, seed=k) for k in range(2)]
+    for model in models:
+        model.lfr.cell.Dzu.requires_grad_(False)
+    before = [model.lfr.cell.Dzu.detach().clone() for model in models]
+    mean = lfrtorch.mean_model(models)
+    assert not mean.lfr.cell.Dzu.requires_grad
+    assert mean.lfr.cell.Cz.requires_grad
+    fitted = lfrtorch.fit(
+        models[0], saturating(), noise="innovation", trainer=SEARCH, monitors=[]
+    ).model
+    assert torch.equal(fitted.lfr.cell.Dzu, before[0])
+    assert not fitted.lfr.cell.Dzu.requires_grad
