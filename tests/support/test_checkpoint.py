@@ -207,6 +207,7 @@ def test_one_layer_of_before_is_read_and_several_are_refused(saved: Path):
     assert np.array_equal(load(saved).simulate(U), small().simulate(U))
     edit(saved, static={"type": "Beyond", "base": network | {"layers": 3}})
     refused(saved, "a network of 3 hidden layers, and this version has networks of one")
+    refused(saved, "before 2026-11-25 (commit 84a9d8a) read it")
 
 
 @pytest.mark.numeric
