@@ -162,7 +162,8 @@ def of_functions(folder: Path) -> list[Case]:
     cases: list[Case] = []
     for function, given in calls:
         function(**deepcopy(given))  # works otherwise
-        names = [name for name in inspect.signature(function).parameters if name not in LEFT_OUT]
+        own = function.__init__ if function is lfrtorch.Settings else function  # __new__ takes all
+        names = [name for name in inspect.signature(own).parameters if name not in LEFT_OUT]
         for name in names:
             for value in [*SCALARS, *others]:
                 said, call = _case(function, deepcopy(given), name, value)

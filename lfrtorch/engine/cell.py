@@ -118,6 +118,8 @@ class LFRCell(nn.Module):
         self.of_system: Held | None = None
         """Entries of A, Bu and Bw that the system of a predictor holds; None of any other model."""
         self._check_shapes()
+        if not isinstance(random, bool):
+            raise InputError(f"random is {random!r}; give True or False.")
         if random and not self.A.is_meta:
             self.reset_parameters()
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.least_squares.box import Box, bounds_of
 from lfrtorch.least_squares.linear_systems import System
+from lfrtorch.least_squares.options import check_guarantee
 from lfrtorch.least_squares.stable_states import Stable
 
 Name = Literal["stable", "contracting"] | float
@@ -33,6 +34,8 @@ class Guarantee(Protocol):
 
 def guarantee_of(name: Name | None, cell: LFRCell, samples: int) -> Guarantee | None:
     """The guarantee of a name; None if there is none, or nothing that could break it."""
+    if isinstance(name, float):
+        check_guarantee(name)
     if name == "contracting" or isinstance(name, float):
         contracting = import_module("lfrtorch.guarantees.contracting").Contracting
         return contracting(cell, name) if isinstance(name, float) else contracting(cell)

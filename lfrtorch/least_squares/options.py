@@ -19,7 +19,7 @@ _GUARANTEE: Any = setting(
 )  # the field of both searches
 
 
-def _check_guarantee(given: object) -> None:
+def check_guarantee(given: object) -> None:
     """Refuse a rate that is none."""
     if isinstance(given, int | float) and not 0.0 < given < 1.0:
         raise InputError(f"guarantee is {given!r}; give a rate above 0 and below 1, or a name.")
@@ -74,7 +74,7 @@ class LevenbergMarquardtOptions:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        _check_guarantee(self.guarantee)
+        check_guarantee(self.guarantee)
 
 
 @dataclass(frozen=True)
@@ -87,4 +87,4 @@ class AdamOptions:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        _check_guarantee(self.guarantee)
+        check_guarantee(self.guarantee)

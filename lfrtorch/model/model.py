@@ -881,8 +881,8 @@ def read_model(
     if isinstance(own, dict) and own.get("layers", 1) != 1:
         raise InputError(
             f"'{folder}' holds a network of {own['layers']} hidden layers, and this version has "
-            "networks of one.\nVersions of 0.1.0 from before 2026-11-25 (commit 84a9d8a) read it; or "
-            "fit again with a torch module of your own: static=own."
+            "networks of one.\nVersions of 0.1.0 from before 2026-11-25 (commit 84a9d8a) read it; "
+            "or fit again with a torch module of your own: static=own."
         )
     try:
         description, weights = of_today(description, weights)

@@ -9,9 +9,11 @@ from reference import normal, random_cell, random_model
 from torch import Tensor
 
 from lfrtorch.data.records import Record
+from lfrtorch.engine.cell import LFRCell
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.bounded_system import BoundedSystem
+from lfrtorch.least_squares.guarantee import guarantee_of
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import CholeskySystem, System
 from lfrtorch.least_squares.problem import Problem
@@ -182,3 +184,10 @@ def test_a_start_that_is_not_stable_stays_within_its_own_circle():
 def test_a_guarantee_has_a_name_or_a_rate():
     with pytest.raises(ValueError, match="guarantee is 'yes'; give 'stable', 'contracting',"):
         LevenbergMarquardt(guarantee="yes")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("rate", [1e308, -0.5, 1.0])
+def test_a_rate_that_is_none_is_refused_before_anything_is_proven(rate: float):
+    cell = LFRCell(1, 1, 2, dtype=torch.float64)
+    with pytest.raises(ValueError, match="give a rate above 0 and below 1"):
+        guarantee_of(rate, cell, 100)
