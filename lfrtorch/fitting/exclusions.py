@@ -45,7 +45,6 @@ _PROVEN = ("contracting", float)
 
 EXCLUSIONS = (
     Exclusion("guarantee", "noise", "a predictor that is stable says nothing of its system"),
-    Exclusion("integrators", "noise", "a linear predictor finds poles near 1 without"),
     Exclusion("guarantee", "integrators", "no integrator contracts", _PROVEN),
     Exclusion("guarantee", "static", "only slopes of networks are bounded", _PROVEN),
     Exclusion("structure", "relaxations", "its w drives no states", ("wiener",)),

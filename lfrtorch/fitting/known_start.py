@@ -25,6 +25,7 @@ from lfrtorch.engine.held import no_feedthrough
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.fitting.driven_states import relaxation_frequencies
 from lfrtorch.fitting.from_outputs import begins_at_outputs
+from lfrtorch.fitting.prediction import without_innovations
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Job, Stage
 from lfrtorch.fitting.trainer import FitResult, StartDivergesError, Trainer
@@ -204,9 +205,7 @@ class FromEquations(Stage):
             known.acts_on = tuple(name for name in known.acts_on if name != "y")
             settings = replace(settings, known=known)
         model = known_model(known, job.linear, in_windows(train, settings.horizon))
-        if settings.noise != "output":  # the search begins at the simulation
-            cell = model.lfr.cell
-            model = replace(model, K=cell.A.new_zeros(cell.nx, cell.ny))
+        model = model if settings.noise == "output" else without_innovations(model)
         if known.outputs is None and len(model.outputs) > 1:
             observed = known.observed([y.name for y in model.outputs])
             pairs = zip(model.outputs, observed, strict=True)

@@ -77,8 +77,8 @@ class PlainSettings:
     noise: Noise = setting(
         "output",
         'where it acts, ``"output"`` or ``"innovation"``, see :func:`lfrtorch.fit`. '
-        'If it is not the output, the linear model has ``refine="prediction"``, too, and '
-        "validation errors are those of predictions one sample ahead.",
+        'If it is not the output, the linear model has ``refine="prediction"``, too, unless it has '
+        "exact integrators, and validation errors are those of predictions one sample ahead.",
     )
     horizon: int | None = setting(
         None,

@@ -18,6 +18,12 @@ def without_gain(models: Model | Sequence[Model]) -> Model | list[Model]:
     return [model if model.K is None else replace(model, K=None) for model in models]
 
 
+def without_innovations(model: Model) -> Model:
+    """A model without a gain with one of 0, where a search for one begins at the simulation."""
+    cell = model.lfr.cell
+    return model if model.K is not None else replace(model, K=cell.A.new_zeros(cell.nx, cell.ny))
+
+
 def predicting(
     models: Model | Sequence[Model], *records: Record | Sequence[Record]
 ) -> tuple[Model | list[Model], *tuple[list[Record], ...]]:

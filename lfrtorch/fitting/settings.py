@@ -120,7 +120,7 @@ class Settings(PlainSettings):
             for name, size in self.init_from.sizes.items():
                 object.__setattr__(self, name, size)
         refuse_together(**self._that_exclude())
-        if self.noise != "output":
+        if self.noise != "output" and not np.any(self.linear.get("integrators", 0)):
             refine = self.linear.get("refine") or "prediction"
             object.__setattr__(self, "linear", {**self.linear, "refine": refine})
         if not self.feedthrough:

@@ -12,6 +12,7 @@ import torch
 from lfrtorch.data.records import Record
 from lfrtorch.fitting.multistart import cheap_starts
 from lfrtorch.fitting.plain_settings import PlainSettings
+from lfrtorch.fitting.prediction import without_innovations
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Job, Stage
 from lfrtorch.fitting.starts import initialise
@@ -80,5 +81,7 @@ def starting_model(
         torch.manual_seed(seed)
         options |= settings.static_map()
     model = initialise(linear, train, **options | {"method": settings.init, "seed": seed})
+    if settings.noise != "output":
+        model = without_innovations(model)
     model.lfr.to(device=settings.device, dtype=settings.dtype)
     return model

@@ -52,8 +52,11 @@ def opponents(
     for refine in wanted:
         if refine in known:
             continue
+        own = {**options, "refine": refine}
+        if refine == "prediction":  # which finds poles near 1 without
+            own["integrators"] = 0
         try:
-            models.append(estimate_bla(records, nx, **{**options, "refine": refine}))
+            models.append(estimate_bla(records, nx, **own))
         except InputError:  # what the criterion of the start does without, such as a longer record
             continue
     if len(models) == 1:

@@ -108,6 +108,18 @@ def test_innovations_keep_what_the_system_holds(options: Any, names: set[str], t
         check_zeros(model, *names)
 
 
+def test_innovations_behind_an_integrator():
+    """The search begins at the simulation, with no innovations."""
+    run = identified(saturating(integrates=True), noise="innovation", linear={"integrators": 1})
+    model = run.model
+    assert integrating_states(model.lfr.cell).tolist() == [False, True]
+    assert model.K is not None
+    assert model.K.any()
+    assert run.fit.history[-1].train < 0.5 * run.fit.history[0].train
+    ahead = run.evaluation.predictions[1][0]
+    assert np.std(ahead.error) < np.std(ahead.linear_error)
+
+
 @pytest.mark.parametrize("structure", ["wiener", "hammerstein", "wiener_hammerstein", "parallel"])
 def test_a_mean_keeps_a_structure(structure: str):
     """Its w does not come back to its z: a first-order change of w leaves z as it is."""
