@@ -127,3 +127,22 @@ def test_the_best_of_any_models_is_as_good_and_nothing_is_nan(
         assert above[best] == 0.0
         assert good[best]
         assert not good[~np.isfinite(squares).all(axis=1)].any()
+
+
+def test_the_ratio_of_two_models_does_not_depend_on_the_unit_of_their_errors():
+    rng = np.random.default_rng(5)
+    squares, counts = rng.chisquare(20, (2, BLOCKS)), np.full(BLOCKS, 20)
+    squares[1] *= 0.25
+    ratio, std = Judge(squares, counts).ratio()
+    assert ratio == pytest.approx(0.5, rel=0.3)
+    assert Judge(1e6 * squares, counts).ratio() == pytest.approx((ratio, std), rel=1e-9)
+    draws = [
+        Judge(rng.chisquare(20, (2, BLOCKS)) * [[1.0], [0.25]], counts).ratio()[0]
+        for _ in range(2000)
+    ]
+    assert std == pytest.approx(np.std(draws), rel=0.6)  # of ten blocks
+
+
+def test_models_are_ranked_with_equal_ones_in_their_order_and_lost_ones_last():
+    squares = np.array([[3.0], [1.0], [np.nan], [1.0], [np.inf]])
+    assert Judge(squares, np.ones(1, int)).ranked() == [1, 3, 0, 2, 4]
