@@ -9,11 +9,15 @@ import typing as _typing
 from importlib import import_module as _import_module
 from importlib.metadata import version as _version
 
+from lfrtorch._support.moved import MOVED as _MOVED
+from lfrtorch._support.moved import install as _install
+
 if _typing.TYPE_CHECKING:
     from lfrtorch._public import *  # noqa: F403
     from lfrtorch._public import __all__ as __all__
 
 __version__ = _version("lfrtorch")
+_install()
 
 
 _ROOMS = ("analysis", "datasets", "distributed", "export", "reporting")
@@ -63,7 +67,7 @@ if not _typing.TYPE_CHECKING:  # a checker would take every name for one of thes
 
     def __getattr__(name: str) -> object:
         """Import a public name's module when it is asked for: a record needs no torch."""
-        if name in _ROOMS:
+        if name in _ROOMS or name in _MOVED:
             return _import_module(f"lfrtorch.{name}")
         if name in _HOME:
             return getattr(_import_module(f"lfrtorch.{_HOME[name]}"), name)

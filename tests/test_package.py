@@ -1,3 +1,4 @@
+import importlib
 import os
 import re
 import subprocess
@@ -14,6 +15,7 @@ import torch
 
 import lfrtorch
 from lfrtorch import _public
+from lfrtorch._support.moved import MOVED
 from lfrtorch.cli.command import COMMANDS, versions
 from lfrtorch.datasets import boucwen, official
 from lfrtorch.reporting import plots
@@ -212,3 +214,22 @@ def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert lfrtorch.rmse(record, y_hat) < 3e-5
     assert np.array_equal(names["run"].model.simulate(record), y_hat)
     assert (tmp_path / "boucwen" / "report.html").is_file()
+
+
+@pytest.mark.parametrize("name", MOVED)
+def test_a_path_of_before_leads_to_the_module(name: str):
+    before, now = (importlib.import_module(f"lfrtorch.{p}{name}") for p in ("", f"{MOVED[name]}."))
+    assert before is now
+    assert now.__spec__ is not None
+    assert now.__spec__.name == now.__name__ == f"lfrtorch.{MOVED[name]}.{name}"
+
+
+def test_names_of_modules_that_are_packages_now():
+    from lfrtorch.distributed import connect  # noqa: F401
+    from lfrtorch.known_systems import emps  # noqa: F401
+    from lfrtorch.model import Model, Resampled, load, simulate_blocks  # noqa: F401
+    from lfrtorch.sklearn import NLLFR  # noqa: F401
+
+    assert Model is lfrtorch.Model
+    with pytest.raises(AttributeError, match="has no attribute 'other'"):
+        _ = lfrtorch.model.other

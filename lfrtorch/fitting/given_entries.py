@@ -112,7 +112,7 @@ class GivenEntries(Stage):
 
 
 def shapes(nx: Any, nu: int, ny: int, nz: Any, nw: Any) -> dict[str, tuple[Any, Any]]:
-    """Shapes of the matrices; a size that is not chosen yet is ``"auto"``."""
+    """Shapes of the matrices; a size that no given matrix has may be ``"auto"``."""
     into, of = {"A": nx, "Bu": nu, "Bw": nw}, {"Cz": nz, "Cy": ny}
     found = {name: (nx, size) for name, size in into.items()}
     found |= {name: (size, nx) for name, size in of.items()}
@@ -129,10 +129,9 @@ def checked(given: Given, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Ar
             )
         matrix = reals(f"fixed {name}", value)
         if matrix.shape != shapes[name]:
-            auto = "; give a number for what is auto" if "auto" in shapes[name] else ""
             raise InputError(
                 f"fixed {name} has the shape {matrix.shape}; the model's has {shapes[name]}, with "
-                f"NaN for entries that are free{auto}."
+                "NaN for entries that are free."
             )
         if np.isinf(matrix).any() or not np.isfinite(matrix).any():
             raise InputError(

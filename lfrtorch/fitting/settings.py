@@ -17,6 +17,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.settings import check_settings, documented, setting
 from lfrtorch.engine.cell import check_dtype
 from lfrtorch.engine.held import IN_SERIES
+from lfrtorch.engine.weights import MATRICES
 from lfrtorch.fitting.exclusions import USUAL, refuse_together
 from lfrtorch.fitting.plain_settings import PlainSettings, Size
 from lfrtorch.fitting.trainer import Trainer
@@ -64,7 +65,7 @@ class Settings(PlainSettings):
         dict,
         "entries of the matrices that are given, with u and y in physical units, "
         '``{"Cy": [[1.0, 0.0]]}``; NaN for those that are free. The start is put into coordinates '
-        "that have them.",
+        "that have them; sizes that are auto follow from the shapes.",
     )
     linear: Mapping[str, Any] = setting(
         dict, 'options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.'
@@ -108,6 +109,7 @@ class Settings(PlainSettings):
         if self.known is not None:
             self._check_known()
             without += ["nx", "nn"]
+        self._take_given_sizes()
         check_settings(self, without=without)
         if self.init_from is None:
             self._check_sizes()
@@ -147,6 +149,16 @@ class Settings(PlainSettings):
         for name, size in rule.items():
             if getattr(self, name) in (None, "auto"):
                 object.__setattr__(self, name, size)
+
+    def _take_given_sizes(self) -> None:
+        """Sizes that are auto follow from the matrices of ``fixed`` that have them."""
+        for name, value in self.fixed.items() if isinstance(self.fixed, Mapping) else ():
+            for axis, size in zip(MATRICES.get(name, ()), np.shape(value), strict=False):
+                if getattr(self, f"n{axis}", None) != "auto":
+                    continue
+                driven = self.relaxations + 2 * self.modes
+                of_linear = (size - driven) // (1 + (self.structure in IN_SERIES))
+                object.__setattr__(self, f"n{axis}", of_linear if axis == "x" else size)
 
     def _check_known(self) -> None:
         """Refuse what is not for a known model."""

@@ -1,1 +1,14 @@
 """An LFR with its scaling, rate and channels, and its states online."""
+
+from __future__ import annotations
+
+from importlib import import_module as _import_module
+
+_NAMES = ("Model", "Resampled", "load", "simulate_blocks")
+
+
+def __getattr__(name: str) -> object:
+    """Import the model when it is asked for: its observers need none of it."""
+    if name in _NAMES:
+        return getattr(_import_module("lfrtorch.model.model"), name)
+    raise AttributeError(f"module 'lfrtorch.model' has no attribute '{name}'")

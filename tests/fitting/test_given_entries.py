@@ -108,8 +108,7 @@ def test_what_is_no_matrix_is_refused(given: dict[str, Any], message: str):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"nx": "auto", "fixed": {"Cy": [[1.0, 0.0]]}}, "give a number for what is auto"),
-        ({"nw": "auto", "fixed": {"Bw": [[1.0], [0.0]]}}, "give a number for what is auto"),
+        ({"nz": 2, "fixed": {"Dzu": [[1.0]]}}, r"the model's has \(2, 1\)"),
         ({"fixed": {"Cy": [[1.0, 0.0, 0.0]]}}, r"the model's has \(1, 2\)"),
     ],
 )

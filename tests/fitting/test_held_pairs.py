@@ -66,6 +66,8 @@ def test_a_structure_with_given_entries(structure: str, guarantee: Any, tmp_path
     assert Cy == pytest.approx(0.7, rel=1e-12)
     errors = [one.train for one in run.fit.history]
     assert errors[-1] < errors[0]
+    if guarantee is not None:
+        assert np.abs(np.linalg.eigvals(model.lfr.cell.A.detach())).max() < 1.0
     again = lfrtorch.load(model.save(tmp_path / "model"))
     assert again.net_parameter_count == model.net_parameter_count < model.parameter_count
     assert {n: m.tolist() for n, m in again.lfr.cell.held.items()} == {
@@ -170,6 +172,24 @@ def test_sizes_are_searched_with_given_entries():
     run = identified(saturating(), fixed={"Cy": [[0.7, FREE]]}, nn="auto", starts=2)
     Cy = run.model.scaler.y_scale[0] * run.model.lfr.cell.Cy[0].detach() * run.fit.averaged
     assert Cy[0].item() == pytest.approx(0.7, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("given", "sizes"),
+    [
+        ({"nx": "auto", "fixed": {"Cy": [[0.7, FREE]]}}, {"nx": 2}),
+        ({"nw": "auto", "nx": 1, "fixed": {"Bw": [[FREE, 0.0]]}}, {"nw": 2}),
+        (
+            {"nx": "auto", "structure": "wiener_hammerstein", "relaxations": 1,
+             "fixed": {"Cy": [[0.7, *[FREE] * 4]]}},
+            {"nx": 2},
+        ),
+    ],
+)  # fmt: skip
+def test_sizes_that_are_auto_follow_from_given_matrices(given: Any, sizes: dict[str, int]):
+    settings = Settings(**{"nx": 2, "nz": 1, "nw": 1, "nn": 3} | given)
+    assert {name: getattr(settings, name) for name in sizes} == sizes
+    assert not settings.searched
 
 
 class Cube(torch.nn.Module):

@@ -17,7 +17,13 @@ from lfrtorch.least_squares.guarantee import guarantee_of
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import CholeskySystem, System
 from lfrtorch.least_squares.problem import Problem
-from lfrtorch.least_squares.stable_states import PoleBounds, fading, largest_modulus, stabilised
+from lfrtorch.least_squares.stable_states import (
+    PoleBounds,
+    fading,
+    largest_modulus,
+    stabilised,
+    within,
+)
 from lfrtorch.maps.network import Network
 from lfrtorch.model.model import Model
 
@@ -70,6 +76,24 @@ def test_exact_integrators_stay():
     assert torch.equal(found[3], A[3])
     assert torch.equal(found[:, 3], A[:, 3])
     assert moduli(fading(found, integrating))[-1] == pytest.approx(LIMIT)
+
+
+@pytest.mark.parametrize("poles", [(1.0005, 0.3, 0.2 + 0.4j), (0.1, 0.3, 0.71 + 0.714j)])
+def test_entries_that_are_held_stay_where_a_pole_is_taken_back(poles: tuple[complex, ...]):
+    """By about the least change: to first order it is along the slope of the free entries."""
+    A = matrix(*poles)
+    held = torch.arange(16).view(4, 4) % 3 == 0
+    found = within(A, NONE, held, LIMIT)
+    assert torch.equal(found[held], A[held])
+    assert moduli(found)[-1] < LIMIT + 1e-9
+    beyond = moduli(A)[-1] - LIMIT
+    leaf = A.clone().requires_grad_()
+    torch.linalg.eigvals(leaf).abs().max().backward()
+    assert leaf.grad is not None
+    slope = leaf.grad.masked_fill(held, 0.0)
+    assert float((found - A).norm()) == pytest.approx(beyond / float(slope.norm()), rel=0.1)
+    inside = matrix(0.3, 0.2, 0.1 + 0.2j)
+    assert within(inside, NONE, held, LIMIT) is inside
 
 
 # --- steps within it ------------------------------------------------------------------------
