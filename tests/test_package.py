@@ -232,4 +232,4 @@ def test_names_of_modules_that_are_packages_now():
 
     assert Model is lfrtorch.Model
     with pytest.raises(AttributeError, match="has no attribute 'other'"):
-        importlib.import_module("lfrtorch.model").other
+        _ = importlib.import_module("lfrtorch.model").other
