@@ -80,7 +80,7 @@ nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(collections|jaxtyping|matplotlib|numpy|pathlib|scipy|threading|torch|typing)\..*"),
     ("py:class", r"\w+"),  # an alias, or a type variable
-    ("py:class", r"lfrtorch\.distributed\.ranks\.Shared"),
+    ("py:class", r"lfrtorch\.distributed\.processes\.Shared"),
     # what the engine's own functions hand each other
     ("py:class", r"lfrtorch\.engine\..*\.(Layout|Matrices|Weights)"),
     ("py:class", r"lfrtorch\.maps\..*"),

@@ -1,6 +1,6 @@
-"""Several processes that share one fit, see ``ranks``."""
+"""Several processes that share one fit, see ``processes``."""
 
-from lfrtorch.distributed.ranks import (
+from lfrtorch.distributed.processes import (
     ProcessGroup,
     ProcessLostError,
     Ranks,
