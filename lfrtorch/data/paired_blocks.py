@@ -43,7 +43,7 @@ BLOCKS = 10
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """What ranks: orders, sizes, starts, and an NL-LFR beside its linear model.
+    """The order of models by their errors: orders, sizes, starts, an NL-LFR and its linear model.
 
     Args:
         squares: sums of squared errors of each model in each block of time; infinite if it
