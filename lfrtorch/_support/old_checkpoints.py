@@ -14,12 +14,12 @@ Checkpoint = tuple[dict[str, Any], dict[str, Tensor]]
 """A description and its weights."""
 
 
-def innermost(description: dict[str, Any]) -> Any:
-    """The static map that a description names, without canonical coordinates around it."""
-    own = description.get("static")
+def innermost(description: dict[str, Any]) -> tuple[Any, int]:
+    """The static map that a description names, and how many canonical coordinates are around it."""
+    own, folds = description.get("static"), 0
     while isinstance(own, dict) and own.get("type") == "Beyond":
-        own = own.get("base")
-    return own
+        own, folds = own.get("base"), folds + 1
+    return own, folds
 
 
 def of_today(description: dict[str, Any], weights: dict[str, Tensor]) -> Checkpoint:
@@ -31,8 +31,10 @@ def of_today(description: dict[str, Any], weights: dict[str, Tensor]) -> Checkpo
     weights = dict(weights)
     if "sizes" not in description:
         description, weights = _linear(description, weights)
-    while isinstance(own := description["static"], dict) and own.get("type") == "Beyond":
-        description, weights = {**description, "static": own.get("base")}, _folded(weights)
+    own, folds = innermost(description)
+    for _ in range(folds):
+        weights = _folded(weights)
+    description = {**description, "static": own}
     if "state_covariance" not in weights:
         weights["state_covariance"] = torch.eye(description["sizes"]["nx"])
     return description, weights

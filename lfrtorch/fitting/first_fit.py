@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -43,22 +43,18 @@ class FirstPart(Stage):
         base: Any = job.settings.trainer
         return replace(base, max_iter=job.settings.first_iterations)
 
-    def options(self, job: Job) -> Mapping[str, Any]:
-        """Starts of a mean go on."""
-        return {"average": job.settings.average}
-
     def keep(self, job: Job, result: FitResult) -> Job:
-        """The best start, or those of a mean."""
+        """The best start; all of them if the model is to be a mean."""
         settings, models = best_start(job, result)
-        if result.members:
-            models = list(result.members)
-            settings = replace(job.settings, starts=len(models))
+        kept = f"seed {settings.seed}"
+        if job.settings.average > 1:
+            settings, models, kept = job.settings, job.models, f"all {len(job.models)} starts"
         chosen = result.history[result.chosen_iteration]
         part = _samples(self.data(job).train)
         job.observer.say(
             f"first {result.iterations} iterations on {part} of {_samples(job.dataset.train)} "
             f"training samples: {quantity(result.seconds, 's')}, error "
-            f"{quantity(chosen.train, common_unit(result.model.outputs))}, seed {settings.seed}"
+            f"{quantity(chosen.train, common_unit(result.model.outputs))}, {kept}"
         )
         return replace(job, settings=settings, models=models)
 

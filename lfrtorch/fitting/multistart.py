@@ -393,13 +393,9 @@ class _Judge:
     def ranked(self, fits: Sequence[Fit]) -> list[Fit]:
         """Sort the fits that have begun, the best first, and those that are refused last."""
         begun = [fit for fit in fits if fit.history]
-        begun.sort(key=lambda fit: id(fit) in self._refused)
-        kept = sum(id(fit) not in self._refused for fit in begun)
-        return [fit for some in (begun[:kept], begun[kept:]) for fit in self._in_order(some)]
-
-    def _in_order(self, fits: Sequence[Fit]) -> list[Fit]:
-        squares = np.array([[self._score(fit)] for fit in fits]).reshape(-1, 1)
-        return [fits[i] for i in Judge(squares, np.ones(1, int)).ranked()]
+        squares = np.array([self._score(fit) for fit in begun]).reshape(-1, 1)
+        order = Judge(squares, np.ones(1, int)).ranked()
+        return sorted((begun[i] for i in order), key=lambda fit: id(fit) in self._refused)
 
     def refuse_what_remembers(
         self, fits: Sequence[Fit], train: Sequence[Record], start: Model

@@ -33,7 +33,12 @@ class Projection:
     @property
     def held(self) -> bool:
         """Whether anything is."""
-        return self._any or self._normals is not None
+        return self._any or self.tied
+
+    @property
+    def tied(self) -> bool:
+        """Whether equations are, between entries."""
+        return self._normals is not None
 
     def __call__(self, columns: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
         """Rows of gradients or directions of the first K entries of θ, projected."""

@@ -82,9 +82,9 @@ class Jacobian:
         for part in penalties:
             gradient = gradient + part.diagonal * part.residual
         gradient = self._project(gradient)
-        if self._bounded is not None:
-            held = ProjectedSystem(system, self._project) if self._project.held else system
-            system = self._bounded(held)
+        if self._project.tied or (self._project.held and self._bounded is not None):
+            system = ProjectedSystem(system, self._project)
+        system = system if self._bounded is None else self._bounded(system)
         return system, gradient
 
     def _complete(self, total: QRAccumulator | GramAccumulator) -> None:

@@ -872,7 +872,7 @@ def read_model(
 ) -> tuple[Model, dict[str, Any] | None, dict[str, Tensor]]:
     """The model in a checkpoint, and what ``write_model`` was given of it besides."""
     description, weights = checkpoint.read(folder, inside)
-    own = innermost(description)
+    own, _ = innermost(description)
     if not static and (name := foreign(own)):
         raise InputError(
             f"'{folder}' holds a static nonlinearity of class {name}, which is not part of this "
