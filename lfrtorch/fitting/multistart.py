@@ -166,8 +166,9 @@ def fit(
     Raises:
         ValueError: no model, none that is stable on the training records at the start, validation
             records that all have too few samples, fewer starts and records than processes,
-            another number of lists of monitors, known models or structures to average, or another
-            ``noise`` than ``"output"`` and a trainer with a ``guarantee``.
+            another number of lists of monitors, known models to average, or predictors of systems
+            with held entries, or another ``noise`` than ``"output"`` and a trainer with a
+            ``guarantee``.
         ProcessLostError, StoppedError: before there was an iterate to keep.
 
     Example:
@@ -338,6 +339,11 @@ def _check(starts: Sequence[Model], watching: Sequence[Sequence[Monitor]], avera
         )
     integer("average", average, 1)
     for model in starts:
+        if average > 1 and model.lfr.cell.of_system:
+            raise InputError(
+                f"average is {average}, and a mean of predictors does not keep what their systems "
+                "hold, as structure, fixed and integrators do; give average=1 or noise='output'."
+            )
         refuse_together(average=average, known="given" if model.known_states else None)
 
 

@@ -17,6 +17,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.settings import check_settings, documented, setting
 from lfrtorch.engine.cell import check_dtype
 from lfrtorch.engine.held import IN_SERIES
+from lfrtorch.engine.innovation import TIED
 from lfrtorch.engine.weights import MATRICES
 from lfrtorch.fitting.exclusions import USUAL, refuse_together
 from lfrtorch.fitting.plain_settings import PlainSettings, Size
@@ -122,6 +123,12 @@ class Settings(PlainSettings):
             for name, size in self.init_from.sizes.items():
                 object.__setattr__(self, name, size)
         refuse_together(**self._that_exclude())
+        if self.average > 1 and not self.averages:
+            raise InputError(
+                f"average is {self.average}, and a mean of predictors does not keep what their "
+                "systems hold of A, Bu and Bw (structure, fixed, integrators): give average=1 or "
+                "noise='output'."
+            )
         if self.noise != "output" and not np.any(self.linear.get("integrators", 0)):
             refine = self.linear.get("refine") or "prediction"
             object.__setattr__(self, "linear", {**self.linear, "refine": refine})
@@ -201,6 +208,13 @@ class Settings(PlainSettings):
         if self.init_from is not None:
             return self.init_from.known_states
         return 0 if self.known is None else len(self.known.states)
+
+    @property
+    def averages(self) -> bool:
+        """Whether a mean of models keeps what their systems hold: not if it is of predictors."""
+        integrates = bool(np.any(self.linear.get("integrators", 0)))
+        holds = self.structure not in ("free", "hammerstein") or not {*TIED}.isdisjoint(self.fixed)
+        return self.noise == "output" or not (holds or integrates)
 
     @property
     def states(self) -> Size | None:

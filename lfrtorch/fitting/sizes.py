@@ -54,7 +54,7 @@ class Sizes(Stage):
 def _of_choice(settings: Settings, choice: Choice) -> Settings:
     """The settings with what was chosen; the fit has no validation records."""
     trainer: Any = settings.trainer
-    averages = allowed("average", STARTS_OF_CHOSEN, vars(settings))
+    averages = settings.averages and allowed("average", STARTS_OF_CHOSEN, vars(settings))
     return replace(
         settings,
         **choice.chosen.sizes,

@@ -263,3 +263,40 @@ def test_a_frozen_matrix_stays_so_in_predictions_and_means():
     ).model
     assert torch.equal(fitted.lfr.cell.Dzu, before[0])
     assert not fitted.lfr.cell.Dzu.requires_grad
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"structure": "wiener"},
+        {"fixed": {"Bu": [[0.7], [FREE]]}},
+        {"linear": {"integrators": 1}},
+    ],
+    ids=str,
+)
+def test_a_mean_of_predictors_keeps_nothing_of_their_systems(options: dict[str, Any]):
+    """Its A has K of one model times Cy of another: what each system holds is lost."""
+    given: dict[str, Any] = {"nx": 2, "nz": 1, "nw": 1, "nn": 3, "noise": "innovation", **options}
+    with pytest.raises(InputError, match="a mean of predictors does not keep"):
+        Settings(**given, average=2)
+    assert Settings(**given).average == 1
+    simulated: dict[str, Any] = {**given, "noise": "output", "average": 2}
+    assert Settings(**simulated).averages
+
+
+def test_sizes_are_searched_with_innovations_and_a_structure():
+    run = identified(saturating(), structure="wiener", nn="auto", noise="innovation", starts=2)
+    assert run.fit.averaged == 1
+    check_zeros(run.model, "Bw")
+
+
+def test_predictors_of_held_systems_are_not_averaged():
+    bla = lfrtorch.estimate_bla(saturating(), nx=2, refine="prediction")
+    models = [
+        lfrtorch.initialise(bla, saturating(), nz=1, nw=1, nn=3, seed=k, structure="hammerstein")
+        for k in range(2)
+    ]
+    for model in models:  # an entry of the state equation
+        model.lfr.cell.hold({"Bu": (torch.tensor([[True], [False]]), model.lfr.cell.Bu.detach())})
+    with pytest.raises(InputError, match="a mean of predictors does not keep"):
+        lfrtorch.fit(models, saturating(), noise="innovation", average=2, monitors=[])
