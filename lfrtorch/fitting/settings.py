@@ -126,8 +126,7 @@ class Settings(PlainSettings):
         if self.average > 1 and not self.averages:
             raise InputError(
                 f"average is {self.average}, and a mean of predictors does not keep what their "
-                "systems hold of A, Bu and Bw (structure, fixed, integrators): give average=1 or "
-                "noise='output'."
+                "systems hold, as structure and fixed do; give average=1 or noise='output'."
             )
         if self.noise != "output" and not np.any(self.linear.get("integrators", 0)):
             refine = self.linear.get("refine") or "prediction"
