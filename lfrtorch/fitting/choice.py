@@ -52,6 +52,7 @@ from lfrtorch.fitting.folds import Fold, as_folded, folds
 from lfrtorch.fitting.forgetting import forgets
 from lfrtorch.fitting.side_by_side import any_of
 from lfrtorch.fitting.trainer import Stop, StoppedError
+from lfrtorch.fitting.windows import begins_at_outputs, in_windows, windows
 from lfrtorch.least_squares.guarantee import Name
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
@@ -60,6 +61,7 @@ from lfrtorch.least_squares.search import Search
 from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.least_squares.term import Seen
 from lfrtorch.linear.bla import refined_near
+from lfrtorch.linear.measured_states import measured_states_model
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.model import Model
 
@@ -212,6 +214,7 @@ def choose_sizes(
     last: str = "nn",
     seed: int = 0,
     guarantee: Name | None = None,
+    horizon: int | None = None,
     watch: Callable[[str], None] = lambda _: None,
     stop: Stop | None = None,
 ) -> Choice:
@@ -229,6 +232,8 @@ def choose_sizes(
         last: name of the last size, nn or degree; nw if the map has no other.
         seed: of the first start; the second has seed + 1000.
         guarantee: of the trainer.
+        horizon: samples ahead that records with a measured start are fitted and judged by. Default:
+            they are simulated from the first output on.
         watch: called with a line after each size.
         stop: asked before each iteration.
 
@@ -253,7 +258,7 @@ def choose_sizes(
     halt = Event()
     path = [(ridge, sum(count for _, count in _RIDGES))] if ridge != 0.0 else _RIDGES
     folded = as_folded(as_records(records))
-    study = _Study(folded, linear, path, guarantee, any_of(halt, stop), halt.set)
+    study = _Study(folded, linear, path, guarantee, horizon, any_of(halt, stop), halt.set)
     given = {} if given is None else dict(given)
     base, tried = study.best_linear(orders), list[Candidate]()
     begun = set[tuple[int, ...]]()
@@ -399,13 +404,16 @@ class _Study:
         linear: Callable[[int], LinearModel],
         path: Sequence[tuple[Ridge, int]],
         guarantee: Name | None,
+        horizon: int | None,
         stop: Stop | None,
         halt: Callable[[], None],
     ) -> None:
         self._records, self._whole, self._ridges = records, linear, path
         self._guarantee: Name | None = guarantee
         self._stop, self._halt = stop, halt
-        self._folds = folds(records, FOLDS)
+        self._at_outputs = begins_at_outputs(records)
+        self._horizon = horizon if self._at_outputs else None
+        self._folds = folds(records, FOLDS, self._horizon or 0)
         self._scale = Scaler.of(records).y_scale
         self.rows = sum(record.y.size for record in records)
         self.counts = np.array(
@@ -459,7 +467,8 @@ class _Study:
         paths, parameters = list[Iterator[_Step]](), 0
         for k, own in product(range(FOLDS), (seed + 1000 * i for i in range(_STARTS))):
             try:
-                model = start(linear.models[k], self._folds[k].train, static, own)
+                train = in_windows(self._folds[k].train, self._horizon)
+                model = start(linear.models[k], train, static, own)
             except InputError:
                 return []
             if not isinstance(model, Model):
@@ -508,9 +517,11 @@ class _Study:
     def _path(self, model: Model, linear: _Linear, k: int) -> Iterator[_Step]:
         """Yield the cost in training and the outputs left out at each ridge."""
         # Nothing here looks at what is measured where it is left out.
-        fold = self._folds[k]
+        fold, train = self._folds[k], self._folds[k].train
+        if self._horizon is not None:
+            train = windows(train, self._horizon, model.lfr.cell.nx, y_scale=model.scaler.y_scale)
         try:
-            problem = Problem.of(model, fold.train, guarantee=self._guarantee)
+            problem = Problem.of(model, train, guarantee=self._guarantee)
         except InputError:  # it diverges on what it is fitted to
             lost = np.full_like(linear.outputs[k], np.inf)
             yield from [_Step(np.inf, lost, lost, False)] * len(self._ridges)
@@ -539,10 +550,14 @@ class _Study:
             state = search.advance(iterations, check=self._check).state
             theta = state.theta
             problem.write(theta)
-            stable = largest_stable_amplitude(model, fold.train) >= max(LOUDER)
-            remembers = stable and not forgets(model, fold.train, linear.models[k]).right
-            through = [simulated(record) for record in self._records]
-            both = fold.left_out(through), fold.begun_again(through, simulated)
+            if self._at_outputs:  # each prediction is short, and of unstable systems too
+                stable, remembers = True, False
+                both = self._ahead(model, fold)
+            else:
+                stable = largest_stable_amplitude(model, train) >= max(LOUDER)
+                remembers = stable and not forgets(model, train, linear.models[k]).right
+                through = [simulated(record) for record in self._records]
+                both = fold.left_out(through), fold.begun_again(through, simulated)
             cost = state.cost if stable and not remembers else np.inf
             yield _Step(cost, *both, remembers)
 
@@ -554,9 +569,19 @@ class _Study:
     def _simulated(self, job: tuple[LinearModel, Fold]) -> tuple[Array, Array]:
         """Return the output where it was left out: simulated through, and begun there."""
         model, fold = job
+        if self._at_outputs:
+            return self._ahead(model.to_model(), fold)
         with np.errstate(over="ignore", invalid="ignore"):
             through = [model.simulate(record) for record in self._records]
             return fold.left_out(through), fold.begun_again(through, model.simulate)
+
+    def _ahead(self, model: Model, fold: Fold) -> tuple[Array, Array]:
+        """Return the output where it was left out, predicted from measured outputs, twice."""
+        ahead = model.simulate
+        if self._horizon is not None:
+            ahead = partial(model.predict, horizon=self._horizon)
+        found = fold.begun_again([record.y for record in self._records], ahead)
+        return found, found
 
     def _left_out(self, name: str) -> list[Array]:
         signals = [getattr(record, name) for record in self._records]
@@ -586,6 +611,8 @@ class _Study:
 
 
 def _refined(model: LinearModel, fold: Fold) -> LinearModel:
+    if begins_at_outputs(fold.train):
+        return measured_states_model(fold.train)
     return refined_near(model, fold.train)
 
 

@@ -2,7 +2,7 @@
 
 A stretch is left out by a mask, and the model is simulated through it. So what is left out begins
 in the state that the inputs before it lead to, and a slow system is not judged by the start states
-of short pieces.
+of short pieces. Records with a measured start are cut instead, as each piece begins at an output.
 
 References:
     Burman, Chow and Nolan, "A cross-validatory method for dependent data", Biometrika 81(2), 1994.
@@ -30,7 +30,8 @@ class Fold(NamedTuple):
         train: the records, their measurements masked where they are left out.
         windows: first sample and the one after the last, of each record; equal if none is left out.
         begun: what is left out of each as a record that begins there, in an estimated state; None
-            if that is too little to tell a state and score the rest.
+            if that is too little to tell a state and score the rest. Of a measured start it begins
+            a horizon before, at the output that the first prediction needs.
     """
 
     train: list[Record]
@@ -47,9 +48,9 @@ class Fold(NamedTuple):
     ) -> np.ndarray:
         """Return ``left_out`` of signals, with simulations that begin there in their place."""
         found = [np.array(signal) for signal in signals]
-        for signal, part, (a, b) in zip(found, self.begun, self.windows, strict=True):
+        for signal, part, (_, b) in zip(found, self.begun, self.windows, strict=True):
             if part is not None:  # whose skipped samples tell its start
-                signal[a + part.skip : b] = simulate(part)[part.skip :]
+                signal[b - part.samples + part.skip : b] = simulate(part)[part.skip :]
         return self.left_out(found)
 
 
@@ -60,10 +61,11 @@ def as_folded(records: Record | Sequence[Record]) -> list[Record]:
     return [with_window(replace(r, **moving) if r.start == "periodic" else r) for r in free]
 
 
-def folds(records: Sequence[Record], count: int) -> list[Fold]:
+def folds(records: Sequence[Record], count: int, horizon: int = 0) -> list[Fold]:
     """Cut records of ``as_folded`` into stretches of about equal length, each left out in turn.
 
-    The scored samples of all records are laid end to end and divided by ``count``.
+    The scored samples of all records are laid end to end and divided by ``count``. Records with a
+    measured start are predicted ``horizon`` samples ahead; 0: simulated from the first output.
 
     Raises:
         ValueError: a stretch without samples, or that leaves nothing to fit.
@@ -84,20 +86,23 @@ def folds(records: Sequence[Record], count: int) -> list[Fold]:
              r.skip + int(np.clip(last - at, 0, r.samples - r.skip)))
             for r, at in zip(records, ends, strict=False)
         ]  # fmt: skip
-        masked = [_masked(r, a, b) for r, (a, b) in zip(records, windows, strict=True)]
-        train = [record for record in masked if record is not None]
+        pairs = zip(records, windows, strict=True)
+        train = [part for r, window in pairs for part in _outside(r, *window, horizon)]
         if last - first < SHORTEST or not train:
             raise InputError(
                 f"the records have {ends[-1]} scored samples, of which {count} stretches are left "
                 f"out in turn; each needs {SHORTEST}: give longer records."
             )
-        begun = [_begun(r, *window) for r, window in zip(records, windows, strict=True)]
+        begun = [_begun(r, *window, horizon) for r, window in zip(records, windows, strict=True)]
         found.append(Fold(train, windows, begun))
     return found
 
 
-def _begun(record: Record, first: int, last: int) -> Record | None:
-    """Return a stretch of a record as one with an estimated start; None if it is too short."""
+def _begun(record: Record, first: int, last: int, horizon: int) -> Record | None:
+    """Return a stretch of a record as one that begins there; None if it is too short."""
+    if record.start == "measured":
+        before = max(first - max(horizon, 1), 0)
+        return replace(record[before:last], skip=first - before) if last > first else None
     skip = score_window(last - first) if last > first else 0
     valid = np.ones_like(record.y, dtype=bool) if record.valid is None else record.valid
     told = valid[first : first + skip].any(axis=0).all() and valid[first + skip : last].any()
@@ -106,12 +111,15 @@ def _begun(record: Record, first: int, last: int) -> Record | None:
     return replace(record[first:last], start="estimated", skip=skip)
 
 
-def _masked(record: Record, first: int, last: int) -> Record | None:
-    """Return the record without some of its measurements; None if none is left."""
+def _outside(record: Record, first: int, last: int, horizon: int) -> list[Record]:
+    """Return the record without some of its measurements; none if none is left."""
+    if record.start == "measured" and last > first:
+        pieces = slice(first), slice(last, record.samples)
+        return [record[p] for p in pieces if len(record.u[p]) > max(horizon, SHORTEST)]
     valid = record.is_valid.copy()
     valid[first:last] = False
     if not valid[record.skip :].any(axis=0).all():
-        return None
+        return []
     # An estimated start is fitted to all samples that are there.
     skip = 0 if record.start == "estimated" else record.skip
-    return replace(record, valid=valid, skip=skip)
+    return [replace(record, valid=valid, skip=skip)]

@@ -8,7 +8,7 @@ shorter ones led.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any, cast
@@ -18,12 +18,11 @@ import torch
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import quantity
-from lfrtorch.data.records import Record
 from lfrtorch.engine.held import held_parameters, measured_states
 from lfrtorch.fitting.given_entries import transformed
 from lfrtorch.fitting.stage import Data, Job, Stage, best_start
 from lfrtorch.fitting.trainer import FitResult, Trainer
-from lfrtorch.fitting.windows import windows_from_outputs
+from lfrtorch.fitting.windows import begins_at_outputs, windows_from_outputs
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model.model import Model
 
@@ -32,17 +31,6 @@ PARTS = (0.1, 0.3)
 
 _ITERATIONS = 10
 """With each of them."""
-
-
-def begins_at_outputs(records: Sequence[Record]) -> bool:
-    """Whether all records have measured starts; a ValueError if some have."""
-    measured = {record.start == "measured" for record in records}
-    if len(measured) > 1:
-        raise InputError(
-            "some records have start 'measured' and others not; give all the same, as the model's "
-            "states are then its outputs."
-        )
-    return measured == {True}
 
 
 def with_measured_states(model: Model) -> Model:

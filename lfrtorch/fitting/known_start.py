@@ -24,12 +24,11 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.held import no_feedthrough
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.fitting.driven_states import relaxation_frequencies
-from lfrtorch.fitting.from_outputs import begins_at_outputs
 from lfrtorch.fitting.prediction import without_innovations
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Job, Stage
 from lfrtorch.fitting.trainer import FitResult, StartDivergesError, Trainer
-from lfrtorch.fitting.windows import in_windows
+from lfrtorch.fitting.windows import begins_at_outputs, in_windows
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.direct_sum import DirectSum

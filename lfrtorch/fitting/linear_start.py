@@ -12,10 +12,10 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number, quantity
 from lfrtorch.data.records import Record
 from lfrtorch.distributed import agreed
-from lfrtorch.fitting.from_outputs import begins_at_outputs
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Job, Stage
+from lfrtorch.fitting.windows import begins_at_outputs
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.measured_states import measured_states_model
@@ -67,11 +67,6 @@ def _of_outputs(job: Job) -> Settings:
                 f"record '{record.name}' has {record.samples} samples and horizon is {horizon}; "
                 "give a longer record or a shorter horizon."
             )
-    if settings.searched:
-        raise InputError(
-            f"{', '.join(settings.searched)}: auto, and sizes are not searched with "
-            "start='measured' yet; give numbers."
-        )
     if settings.known_states or settings.nx == ny:
         return settings
     if settings.nx != "auto":
@@ -118,6 +113,13 @@ def linear_model(
         linear = estimate_bla(data, cast(int, settings.nx), **settings.linear)
     tell(linear, observer)
     return linear, scan
+
+
+def approximation(records: Sequence[Record], nx: int, settings: Settings) -> LinearModel:
+    """The linear model of an order, or that whose states are the outputs."""
+    if begins_at_outputs(records):
+        return measured_states_model(records)
+    return estimate_bla(records, nx, **settings.linear)
 
 
 def tell(linear: LinearModel, observer: Observer) -> None:

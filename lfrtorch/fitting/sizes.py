@@ -11,14 +11,15 @@ from lfrtorch.data.records import Record
 from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.exclusions import allowed
 from lfrtorch.fitting.first_fit import part_of
+from lfrtorch.fitting.from_outputs import with_measured_states
 from lfrtorch.fitting.given_entries import with_given
-from lfrtorch.fitting.linear_start import linear_records, tell
+from lfrtorch.fitting.linear_start import approximation, linear_records, tell
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.refit import estimation_records
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Job, Stage
 from lfrtorch.fitting.start_models import STARTS_OF_CHOSEN, starting_model
-from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.fitting.windows import begins_at_outputs
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.model import Model
 
@@ -43,7 +44,7 @@ class Sizes(Stage):
         choice = _choice(replace(job, dataset=dataset))
         settings = _of_choice(job.settings, choice)
         records = linear_records(train, settings, Observer())
-        estimate = partial(estimate_bla, records, **settings.linear)
+        estimate = partial(approximation, records, settings=settings)
         linear = estimate(choice.nx)
         begun = linear if settings.nx == choice.nx else estimate(cast(int, settings.nx))
         tell(linear, job.observer)
@@ -77,25 +78,25 @@ def _choice(job: Job) -> Choice:
     orders = job.order_scan.orders if job.order_scan else ()
     given = {name: size for name, size in settings.sizes.items() if isinstance(size, int)}
     approximated = linear_records(records, settings, Observer())
-
-    def approximation(nx: int) -> LinearModel:
-        return estimate_bla(approximated, nx, **settings.linear)
+    at_outputs = begins_at_outputs(records)
 
     def start(bla: LinearModel, train: Sequence[Record], sizes: dict[str, int], seed: int) -> Model:
         begun = starting_model(train, replace(settings, nx=bla.nx, **sizes), bla, seed)
+        begun = with_measured_states(begun) if at_outputs else begun
         return with_given(begun, settings.fixed)[0]
 
     searched = settings.nx == "auto"
     choice = choose_sizes(
         records,
         [nx for nx in orders if nx <= job.linear.nx] if searched else [job.linear.nx],
-        approximation,
+        partial(approximation, approximated, settings=settings),
         start,
         given=given,
         ridge=0.0 if settings.ridge == "auto" else settings.ridge,
         last=settings.size_names[-1],
         seed=settings.seed,
         guarantee="stable" if settings.trainer.guarantee == "stable" else None,
+        horizon=settings.horizon,
         watch=observer.say,
         stop=job.stop,
     )

@@ -96,6 +96,17 @@ def windows(
     return found
 
 
+def begins_at_outputs(records: Sequence[Record]) -> bool:
+    """Whether all records have measured starts; a ValueError if some have."""
+    measured = {record.start == "measured" for record in records}
+    if len(measured) > 1:
+        raise InputError(
+            "some records have start 'measured' and others not; give all the same, as the model's "
+            "states are then its outputs."
+        )
+    return measured == {True}
+
+
 def in_windows(records: Sequence[Record], horizon: int | None) -> Sequence[Record]:
     """Training records as a fit simulates them: in windows if they begin at outputs, else whole."""
     if horizon is None or any(record.start != "measured" for record in records):

@@ -21,8 +21,9 @@ def measured_states_model(records: Sequence[Record]) -> LinearModel:
     """
     clock, first, scaler = time.perf_counter(), records[0], Scaler.of(records)
     u_offset, y_offset = scaler.u_offset, scaler.y_offset
+    whole = [np.all(r.is_valid, axis=1) for r in records]
     u, y, after = (
-        np.concatenate(parts)
+        np.concatenate([part[v[:-1] & v[1:]] for part, v in zip(parts, whole, strict=True)])
         for parts in (
             [r.u[:-1] - u_offset for r in records],
             [r.y[:-1] - y_offset for r in records],

@@ -117,6 +117,42 @@ def test_a_checkpoint_predicts_the_same(with_equations: lfrtorch.Run, flights: D
     np.testing.assert_allclose(loaded.ahead(test, 7), expected, rtol=1e-9)
 
 
+def test_sizes_are_searched_where_outputs_are_states(flights: Dataset) -> None:
+    """The system is unstable in itself: no simulation through what is left out is near it."""
+    data = replace(flights, train=[flights.train[0][:600]], validation=[])
+    searched: dict[str, Any] = {"nx": "auto", "nz": 1, "nw": 1, "nn": "auto"}
+    run = lfrtorch.identify(data, Settings(**searched, horizon=HORIZON))
+    assert run.choice is not None
+    assert run.choice.chosen.ratio < 0.8  # errors where each stretch was left out
+    assert torch.equal(run.model.lfr.cell.Cy, torch.eye(2, dtype=torch.float64))
+    ((record, linear, y_hat),) = run.choice.left_out
+    errors = [np.abs(record.errors(signal)).mean() for signal in (y_hat, linear)]
+    assert errors[0] < errors[1] < np.inf
+
+
+def test_sizes_without_a_horizon_are_judged_by_simulations_from_an_output() -> None:
+    """Each stretch begins at its first output."""
+    u = np.random.default_rng(3).standard_normal(400)
+    y = np.zeros(401)
+    for k in range(400):
+        y[k + 1] = 0.6 * y[k] + np.tanh(2.0 * u[k])
+    record = Record(u, y[:400], start="measured")
+    settings = Settings(nx=1, nz=1, nw=1, nn="auto")
+    run = lfrtorch.identify(Dataset("steps", [record], [], []), settings)
+    assert run.choice is not None
+    assert run.choice.chosen.ratio < 0.1
+
+
+def test_samples_that_are_not_valid_tell_no_linear_model(flights: Dataset) -> None:
+    (one,) = flights.train
+    valid = np.ones(one.y.shape, dtype=bool)
+    valid[200:210] = False
+    y = np.where(valid, one.y, 50.0)
+    found = measured_states_model([replace(one, y=y, valid=valid)])
+    expected = measured_states_model([one[:200], one[210:]])
+    np.testing.assert_allclose(found.A, expected.A, rtol=1e-2, atol=1e-3)
+
+
 def test_a_black_box_has_the_outputs_as_states(flights: Dataset) -> None:
     settings = Settings(nx="auto", nz=1, nw=1, nn=6, horizon=HORIZON, starts=1)
     run = lfrtorch.identify(flights, settings)
@@ -179,7 +215,6 @@ def test_parts_of_a_file_begin_at_their_own_outputs(tmp_path) -> None:
         ({"nx": 3, "nn": 2}, "the 2 outputs are the states; give nx=2"),
         ({"nx": 2, "nn": 2, "nz": 1, "structure": "parallel"}, "4 states for 2 outputs"),
         ({"nx": 2, "nn": 2, "relaxations": 1}, "3 states for 2 outputs; give nx=2"),
-        ({"nx": 2, "nn": "auto"}, "nn: auto, and sizes are not searched"),
     ],
 )
 def test_what_cannot_be_is_refused(flights: Dataset, settings: dict[str, Any], message: str):
