@@ -24,6 +24,7 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.held import no_feedthrough
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.fitting.driven_states import relaxation_frequencies
+from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.prediction import without_innovations
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Job, Stage
@@ -249,6 +250,15 @@ class Parameters(Stage):
         return replace(job, models=[model])
 
 
+def fitted_equations(job: Job, linear: LinearModel, train: Sequence[Record]) -> Job:
+    """The job with a known model whose parameters are fitted to some records."""
+    dataset = replace(job.dataset, train=train, validation=[], selection=[])
+    job = replace(job, dataset=dataset, linear=linear, observer=Observer())
+    for stage in (FromEquations(), Parameters()):
+        job = stage.run(job) if stage.when(job) else job
+    return job
+
+
 class Learned(Stage):
     """What is learned beside a known model, one draw for each start."""
 
@@ -259,7 +269,7 @@ class Learned(Stage):
     def run(self, job: Job) -> Job:
         """The models with it, or the known model alone."""
         settings, model = job.settings, job.models[0]
-        if _grey(settings):
+        if not settings.learns:
             settings, models = replace(settings, starts=1, ridge=0.0), [model]
         else:
             settings = replace(settings, starts=_asked(settings))
@@ -268,11 +278,6 @@ class Learned(Stage):
         for model in models:
             model.lfr.to(device=settings.device, dtype=settings.dtype)
         return replace(job, settings=settings, models=models, ridge=None)
-
-
-def _grey(settings: Settings) -> bool:
-    """Whether nothing is learned beside the known model."""
-    return settings.nn == 0 and not settings.nx and settings.static == "network"
 
 
 def _asked(settings: Settings) -> int:
@@ -284,7 +289,7 @@ def _count(settings: Settings) -> int:
     """Number of values that the parameters start from."""
     if not cast(Known, settings.known).parameters:
         return 1
-    return _asked(settings) if _grey(settings) else _STARTS
+    return _STARTS if settings.learns else _asked(settings)
 
 
 def physical(model: Model) -> dict[str, float]:

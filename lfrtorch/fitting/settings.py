@@ -155,6 +155,8 @@ class Settings(PlainSettings):
         for name, size in rule.items():
             if getattr(self, name) in (None, "auto"):
                 object.__setattr__(self, name, size)
+        if self.ridge == "auto" and not self.learns:
+            object.__setattr__(self, "ridge", 0.0)
 
     def _take_given_sizes(self) -> None:
         """Sizes that are auto follow from the matrices of ``fixed`` that have them."""
@@ -168,9 +170,6 @@ class Settings(PlainSettings):
 
     def _check_known(self) -> None:
         """Refuse what is not for a known model."""
-        for name in ("degree", "ridge"):
-            if getattr(self, name) == "auto":
-                raise InputError(f"{name} is auto, and beside a known model none is searched.")
         integer("nx", self.nx, 0)
         integer("nn", self.nn, 0)
 
@@ -207,6 +206,11 @@ class Settings(PlainSettings):
         if self.init_from is not None:
             return self.init_from.known_states
         return 0 if self.known is None else len(self.known.states)
+
+    @property
+    def learns(self) -> bool:
+        """Whether a map or states are learned, of a known model those beside it."""
+        return self.known is None or bool(self.nn or self.nx or self.static != "network")
 
     @property
     def averages(self) -> bool:

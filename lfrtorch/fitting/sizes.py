@@ -13,7 +13,8 @@ from lfrtorch.fitting.exclusions import allowed
 from lfrtorch.fitting.first_fit import part_of
 from lfrtorch.fitting.from_outputs import with_measured_states
 from lfrtorch.fitting.given_entries import with_given
-from lfrtorch.fitting.linear_start import approximation, linear_records, tell
+from lfrtorch.fitting.known_start import fitted_equations, with_learned
+from lfrtorch.fitting.linear_start import approximation, linear_records, of_linear_model, tell
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.refit import estimation_records
 from lfrtorch.fitting.settings import Settings
@@ -46,7 +47,8 @@ class Sizes(Stage):
         records = linear_records(train, settings, Observer())
         estimate = partial(approximation, records, settings=settings)
         linear = estimate(choice.nx)
-        begun = linear if settings.nx == choice.nx else estimate(cast(int, settings.nx))
+        same = settings.known is not None or settings.nx == choice.nx
+        begun = linear if same else estimate(cast(int, settings.nx))
         tell(linear, job.observer)
         found = {"linear": linear, "begun": begun, "choice": choice}
         return replace(job, dataset=dataset, settings=settings, **found)
@@ -55,10 +57,13 @@ class Sizes(Stage):
 def _of_choice(settings: Settings, choice: Choice) -> Settings:
     """The settings with what was chosen; the fit has no validation records."""
     trainer: Any = settings.trainer
+    sizes = {name: choice.chosen.sizes[name] for name in settings.size_names}
+    if settings.known is None:
+        sizes["nx"] = choice.chosen.sizes["nx"]
     averages = settings.averages and allowed("average", STARTS_OF_CHOSEN, vars(settings))
     return replace(
         settings,
-        **choice.chosen.sizes,
+        **sizes,
         ridge=choice.chosen.ridge,
         average=STARTS_OF_CHOSEN if settings.static == "network" and averages else 1,
         refit=False,
@@ -76,11 +81,19 @@ def _choice(job: Job) -> Choice:
         some = sum(record.samples for record in records)
         observer.say(f"sizes are chosen on {some} of {samples} training samples")
     orders = job.order_scan.orders if job.order_scan else ()
-    given = {name: size for name, size in settings.sizes.items() if isinstance(size, int)}
+    asked = {**settings.sizes, "nx": of_linear_model(settings).nx}
+    given = {name: size for name, size in asked.items() if isinstance(size, int)}
+    equations = dict[int, Job]()  # fitted without each stretch, by its linear model
     approximated = linear_records(records, settings, Observer())
     at_outputs = begins_at_outputs(records)
 
     def start(bla: LinearModel, train: Sequence[Record], sizes: dict[str, int], seed: int) -> Model:
+        if settings.known is not None:
+            if id(bla) not in equations:
+                equations[id(bla)] = fitted_equations(job, bla, train)
+            fitted = equations[id(bla)]
+            own = replace(fitted.settings, **sizes)
+            return with_learned(fitted.models[0], train, own, seed)
         begun = starting_model(train, replace(settings, nx=bla.nx, **sizes), bla, seed)
         begun = with_measured_states(begun) if at_outputs else begun
         return with_given(begun, settings.fixed)[0]

@@ -325,16 +325,34 @@ def test_equations_that_run_away_are_refused_with_what_may_help():
         identified(record(0.0), known=stiff, nn=0)
 
 
+def test_another_thing_than_known_equations_is_refused():
+    with pytest.raises(InputError, match=r"known is .pendulum.; give an lfrtorch\.Known"):
+        identified(record(0.0), known="pendulum")
+
+
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    "searched",
     [
-        ({"known": "pendulum"}, "known is 'pendulum'; give an lfrtorch.Known"),
-        ({"nz": 1, "nw": 1, "nn": 2, "ridge": "auto"}, "beside a known model none is searched"),
+        {"nz": 1, "nw": 1, "nn": 4, "ridge": "auto"},
+        {"nz": 1, "nw": 1, "static": "polynomial", "degree": "auto"},
     ],
+    ids=str,
 )
-def test_settings_that_exclude_it_are_refused(settings: dict[str, Any], message: str):
-    with pytest.raises(InputError, match=message):
-        identified(record(0.0), **settings)
+def test_what_is_learned_beside_equations_is_searched(grey: lfrtorch.Run, searched: dict[str, Any]):
+    """The equations are fitted again without each stretch that judges."""
+    run = identified(record(drag=0.3), **searched)
+    assert run.choice is not None
+    assert run.choice.chosen.ratio < 0.5  # of the linear model's error where it was left out
+    assert run.settings.searched == ()
+    assert run.settings.nx == 0
+    test = record(drag=0.3, seed=1)
+    errors = [lfrtorch.rmse(test, model.simulate(test)) for model in (run.model, grey.model)]
+    assert errors[0] < 0.5 * errors[1]
+    assert all(c.sizes["nx"] == 2 for c in run.choice.candidates)
+
+
+def test_a_ridge_of_nothing_that_is_learned_is_none():
+    assert Settings(known=known(), nn=0, ridge="auto").ridge == 0.0
 
 
 def test_a_ridge_tells_apart_what_the_data_do_not(both: lfrtorch.Run):
