@@ -29,13 +29,17 @@ def structure(cell: LFRCell, kind: str, *, before: int | None = None) -> Held:
     - ``"hammerstein"``: z is of the inputs alone, Cz = 0;
     - ``"wiener_hammerstein"``: the first states, which u drives, make z; the others, which w alone
       drives, see nothing of them. So w never comes back to z;
-    - ``"parallel"``: the same with a network in which each neuron sees one z and acts on the w of
-      the same number: branches that share their poles at most.
+    - ``"parallel"``: the same with a function for each z, which makes the w of the same number:
+      branches that share their poles at most. A network is held so; of another map each branch has
+      its own (:class:`lfrtorch.maps.direct_sum.DirectSum`).
 
     Args:
         cell: its sizes count.
         kind: which of these.
         before: how many states make z. Default: half of them.
+
+    Raises:
+        ValueError: a map that is no function for each z.
     """
     every, zero = torch.tensor(True), torch.tensor(0.0)
     after = torch.arange(cell.nx) >= (cell.nx // 2 if before is None else before)
@@ -48,11 +52,7 @@ def structure(cell: LFRCell, kind: str, *, before: int | None = None) -> Held:
         found = {"A": after[:, None] != after, "Bu": after[:, None], "Bw": ~after[:, None]}
         found["Cz"] = after
     if kind == "parallel":
-        assert cell.static is not None
-        neurons = len(cell.static.get_parameter("Wz"))
-        own = torch.arange(neurons) * cell.nz // neurons
-        apart = own[:, None] != torch.arange(cell.nz)
-        found |= {"static.Wz": apart, "static.Ww": apart.mT}
+        found |= {f"static.{name}": mask for name, mask in cell.map.across_branches().items()}
     return {name: (mask, zero) for name, mask in found.items()}
 
 

@@ -50,7 +50,6 @@ EXCLUSIONS = (
     Exclusion("structure", "relaxations", "its w drives no states", ("wiener",)),
     Exclusion("structure", "modes", "its w drives no states", ("wiener",)),
     Exclusion("structure", "z_feedthrough", "its z is of the inputs alone", ("hammerstein",)),
-    Exclusion("structure", "static", "its map is a network for each z", ("parallel",)),
     Exclusion("known", "guarantee", "nothing is proven of a known model"),
     Exclusion("known", "structure", "its matrices are given"),
     Exclusion("known", "relaxations", "nx is the number of states beside its own"),

@@ -24,6 +24,7 @@ from lfrtorch.fitting.plain_settings import PlainSettings, Size
 from lfrtorch.fitting.trainer import Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.maps.direct_sum import DirectSum
 from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.model.known import Known
 from lfrtorch.model.model import Model
@@ -265,10 +266,16 @@ class Settings(PlainSettings):
         """The static map for :func:`lfrtorch.initialise`, if it is not the network."""
         if self.static == "network":
             return {}
-        if self.static == "polynomial":
-            assert isinstance(self.nz, int)
-            assert isinstance(self.nw, int)
-            assert isinstance(self.degree, int)
-            return {"static": Polynomial(self.nz, self.nw, self.degree)}
-        assert callable(self.static)
-        return {"static": self.static(nz=self.nz, nw=self.nw)}
+        assert isinstance(self.nz, int)
+        assert isinstance(self.nw, int)
+        if self.structure != "parallel":
+            return {"static": self._map_of(self.nz, self.nw)}
+        branches = [self._map_of(1, 1) for _ in range(self.nz)]
+        return {"static": DirectSum(branches, [(1, 1)] * self.nz)}
+
+    def _map_of(self, nz: int, nw: int) -> Module:
+        """A static map of these sizes."""
+        if callable(self.static):
+            return self.static(nz=nz, nw=nw)
+        assert isinstance(self.degree, int)
+        return Polynomial(nz, nw, self.degree)

@@ -134,13 +134,12 @@ def initialise(
     integer("relaxations", relaxations, 0)
     integer("modes", modes, 0)
     check_dtype(dtype)
-    _check_structure(structure, nz, nw, nn)
+    _check_structure(structure, nz, nw, nn if static is None else None)
     refuse_together(
         structure=structure,
         relaxations=relaxations,
         modes=modes,
         z_feedthrough=z_feedthrough,
-        static="network" if static is None else static,
     )
     if not feedthrough:
         _check_no_feedthrough(bla, structure, z_feedthrough)

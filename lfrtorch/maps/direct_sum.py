@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numba.np.numpy_support import carray
 from torch import Tensor
 from torch.nn import Module, ModuleList
@@ -123,6 +123,10 @@ class DirectSum(StaticMap):
             for number, (part, z, w, _) in enumerate(self._placed())
             for each in part.symmetries
         ]
+
+    def across_branches(self) -> dict[str, Bool[Tensor, ...]]:
+        """None, if each part is a branch."""
+        return {} if set(self.sizes_of_parts) == {(1, 1)} else super().across_branches()
 
     @property
     def outputs_have_parameters(self) -> bool:

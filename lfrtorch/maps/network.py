@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -124,6 +124,12 @@ class Network(StaticMap):
             Symmetry("z", slice(0, self.nz), lambda T, W: {"Wz": -W["Wz"] @ T}),
             Symmetry("w", slice(0, self.nw), lambda T, W: {"Ww": T @ W["Ww"], "bw": T @ W["bw"]}),
         ]
+
+    def across_branches(self) -> dict[str, Bool[Tensor, ...]]:
+        """Weights of the neurons for other z and w than the branch's own."""
+        branch = torch.arange(len(self.Wz)) * self.nz // len(self.Wz)
+        across = branch[:, None] != torch.arange(self.nz)
+        return {"Wz": across, "Ww": across.mT}
 
     @property
     def meaning(self) -> str:

@@ -11,12 +11,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numba.np.numpy_support import carray
 from torch import Tensor
 from torch.func import functional_call, jacrev, vmap
 from torch.nn import Module
 
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.maps.enclosure import Enclosure, Interval
 from lfrtorch.maps.formula_code import machine_code
@@ -130,6 +131,17 @@ class StaticMap(Module):
     def symmetries(self) -> list[Symmetry]:
         """Changes of coordinates that the weights absorb."""
         return []
+
+    def across_branches(self) -> dict[str, Bool[Tensor, ...]]:
+        """Entries of the weights that are zero where each w is a function of one z.
+
+        Raises:
+            ValueError: a map whose zeros make no such functions.
+        """
+        raise InputError(
+            "structure is 'parallel', and its map is one of all z; give a network, or "
+            "DirectSum(branches, [(1, 1)] * nz) of lfrtorch.maps.direct_sum."
+        )
 
     @property
     def outputs_have_parameters(self) -> bool:

@@ -159,6 +159,40 @@ def test_driven_states_stand_behind_a_static_map():
     assert run.fit.history[-1].train < run.fit.history[0].train
 
 
+class Cubic(torch.nn.Module):
+    """w = z + a z³, all of one kind."""
+
+    def __init__(self, nz: int, nw: int) -> None:
+        super().__init__()
+        self.a = torch.nn.Parameter(0.1 * torch.ones(nw, dtype=torch.float64))
+        self.W = torch.nn.Parameter(torch.ones(nw, nz, dtype=torch.float64))
+
+    def forward(self, z: torch.Tensor) -> torch.Tensor:
+        w = z @ self.W.mT
+        return w + self.a * w**3
+
+
+@pytest.mark.parametrize("static", ["polynomial", Cubic], ids=["polynomial", "own"])
+def test_branches_in_parallel_have_maps_of_any_kind(static: Any):
+    """Each w is a function of the z of the same number alone."""
+    run = identified(saturating(), structure="parallel", static=static, nz=2, nw=2)
+    assert run.fit.history[-1].train < run.fit.history[0].train
+    w = run.model.lfr.cell.map
+    z = torch.randn(5, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for own, other in ((0, 1), (1, 0)):
+        moved = z.index_add(1, torch.tensor([other]), torch.ones_like(z[:, :1]))
+        change = (w(moved) - w(z)).detach().abs()
+        assert not change[:, own].any()
+        assert change[:, other].min() > 0.0
+
+
+def test_one_map_of_all_z_is_no_parallel_branches():
+    bla = lfrtorch.estimate_bla(saturating(), nx=2)
+    options: dict[str, Any] = {"nz": 2, "nw": 2, "structure": "parallel"}
+    with pytest.raises(InputError, match="its map is one of all z; give a network"):
+        lfrtorch.initialise(bla, saturating(), static=lfrtorch.Polynomial(2, 2, 3), **options)
+
+
 @pytest.mark.parametrize("structure", ["hammerstein", "parallel"])
 def test_sizes_of_a_structure_are_searched(structure: str):
     sizes = {"nz": "auto", "nw": "auto"} if structure == "hammerstein" else {"nz": 2, "nw": 2}
