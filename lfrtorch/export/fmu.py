@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import platform
 import shutil
 import subprocess
 import tempfile
 import uuid
 from pathlib import Path
-from xml.etree import ElementTree
+from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
@@ -18,33 +19,6 @@ from lfrtorch.export.c_source import c_source
 from lfrtorch.export.equations import Equations, equations, printable
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.model import Model
-
-_OTHERS = {
-    2: ["Integer", "Boolean", "String"],
-    3: ["Float32", *(f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)),
-        "Boolean", "String", "Binary", "Clock"],
-}  # fmt: skip
-"""Types of variables that there are none of, by the version of FMI."""
-
-_UNSUPPORTED = {
-    2: [
-        "CancelStep",
-        *(f"Get{kind}Status" for kind in ("", "Real", "Integer", "Boolean", "String")),
-        "SetRealInputDerivatives", "GetRealOutputDerivatives",
-    ],
-    3: [
-        "GetNumberOfVariableDependencies", "GetVariableDependencies", "GetAdjointDerivative",
-        "EnterConfigurationMode", "ExitConfigurationMode", "EnterEventMode", "EnterStepMode",
-        *(f"{way}{what}{form}" for way in ("Get", "Set") for what in ("Interval", "Shift")
-          for form in ("Decimal", "Fraction")),
-        "EvaluateDiscreteStates", "UpdateDiscreteStates", "EnterContinuousTimeMode",
-        "CompletedIntegratorStep", "SetTime", "SetContinuousStates",
-        "GetContinuousStateDerivatives", "GetEventIndicators", "GetContinuousStates",
-        "GetNominalsOfContinuousStates", "GetNumberOfEventIndicators",
-        "GetNumberOfContinuousStates", "GetOutputDerivatives", "ActivateModelPartition",
-    ],
-}  # fmt: skip
-"""Functions that a version has and no unit for co-simulation of a sampled model needs."""
 
 
 def write_fmu(
@@ -72,25 +46,35 @@ def write_fmu(
     Example:
         >>> lfrtorch.export.write_fmu(model, "actuator.fmu", "actuator")
     """
+    Path(path).write_bytes(fmu(model, name, version))
+
+
+def fmu(model: Model | LinearModel, name: str, version: int) -> bytes:
+    """The archive that an FMU is."""
     header, source = c_source(model, name)
     e = equations(model)
-    guid = str(uuid.uuid5(uuid.NAMESPACE_OID, header + source))
-    known = {"guid": guid, "version": version, "u_start": e.u_offset.tolist()}
-    known |= {"others": _OTHERS[version], "unsupported": _UNSUPPORTED[version]}
-    files = {
-        f"{name}.h": header,
-        f"{name}.c": source,
-        f"{name}_fmu.c": e.rendered("fmu.c", name, **known),
-    }
-    binary = _compiled(files, name)
-    machine = "linux64" if version == 2 else "x86_64-linux"
-    with ZipFile(path, "w", ZIP_DEFLATED) as archive:
-        archive.writestr("modelDescription.xml", _description(e, name, guid, version))
+    known: dict[str, Any] = {"version": version, "u_start": e.u_offset.tolist()}
+    known["guid"] = str(uuid.uuid5(uuid.NAMESPACE_OID, header + source))
+    known |= {"title": " ".join(e.about(name)[:2]), "ts": repr(1.0 / e.fs)}
+    known["variables"] = _variables(e) if version == 3 else _variables(e)[:-1]  # FMI 3 has the time
+    known["units"] = list(dict.fromkeys(unit for _, unit, *_ in known["variables"] if unit))
+    # Which inputs each output depends on, and at the beginning which states.
+    M, nu, ny, first = e.matrices, len(e.inputs), len(e.outputs), int(version == 2)
+    by_w = (M.Dyw != 0).any(axis=1)[:, None] & (M.Dzu != 0).any(axis=0)
+    by_u = (M.Dyu != 0) | by_w
+    known["depends"] = [(first + np.flatnonzero(row)).tolist() for row in by_u]
+    known["states"] = [first + nu + ny + i for i in range(e.sizes["nx"])]
+    files = {f"{name}.h": header, f"{name}.c": source}
+    files[f"{name}_fmu.c"] = e.rendered("fmu.c", name, **known)
+    archive, machine = io.BytesIO(), "linux64" if version == 2 else "x86_64-linux"
+    with ZipFile(archive, "w", ZIP_DEFLATED) as made:
+        made.writestr(f"binaries/{machine}/{name}.so", _compiled(files, name))
+        made.writestr("modelDescription.xml", e.rendered("fmu.xml", name, **known))
         if version == 3:
-            archive.writestr("sources/buildDescription.xml", _build(name))
-        archive.writestr(f"binaries/{machine}/{name}.so", binary)
+            made.writestr("sources/buildDescription.xml", e.rendered("fmu_build.xml", name))
         for file, text in files.items():
-            archive.writestr(f"sources/{file}", text)
+            made.writestr(f"sources/{file}", text)
+    return archive.getvalue()
 
 
 def _compiled(files: dict[str, str], name: str) -> bytes:
@@ -117,94 +101,14 @@ def _compiled(files: dict[str, str], name: str) -> bytes:
         return (Path(folder) / "made.so").read_bytes()
 
 
-def _build(name: str) -> bytes:
-    """buildDescription.xml of FMI 3.0: how the sources are compiled."""
-    root = ElementTree.Element("fmiBuildDescription", fmiVersion="3.0")
-    built = ElementTree.SubElement(root, "BuildConfiguration", modelIdentifier=name)
-    listed = ElementTree.SubElement(built, "SourceFileSet", language="C99")
-    for file in (f"{name}.c", f"{name}_fmu.c"):
-        ElementTree.SubElement(listed, "SourceFile", name=file)
-    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
-
-
-def _description(e: Equations, name: str, guid: str, version: int) -> bytes:
-    """modelDescription.xml."""
-    token = "guid" if version == 2 else "instantiationToken"
-    State = "FMUstate" if version == 2 else "FMUState"
-    root = ElementTree.Element("fmiModelDescription", {
-        "fmiVersion": f"{version}.0", "modelName": name, token: guid,
-        "description": " ".join(e.about(name)[:2]), "generationTool": "lfrtorch",
-        "variableNamingConvention": "flat",
-    })  # fmt: skip
-    unit = ElementTree.SubElement(root, "CoSimulation", {
-        "modelIdentifier": name, "canHandleVariableCommunicationStepSize": "true",
-        f"canGetAndSet{State}": "true", f"canSerialize{State}": "true",
-        f"providesDirectionalDerivative{'' if version == 2 else 's'}": "true",
-    })  # fmt: skip
-    if version == 2:
-        listed = ElementTree.SubElement(unit, "SourceFiles")
-        for file in (f"{name}.c", f"{name}_fmu.c"):
-            ElementTree.SubElement(listed, "File", name=file)
-    units = list(dict.fromkeys(c.unit for c in (*e.inputs, *e.outputs) if c.unit))
-    if units:
-        listed = ElementTree.SubElement(root, "UnitDefinitions")
-        for one in units:
-            ElementTree.SubElement(listed, "Unit", name=printable(one))
-    ElementTree.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(1.0 / e.fs))
-    listed = ElementTree.SubElement(root, "ModelVariables")
-    for number, (label, symbol, causality, start) in enumerate(_variables(e)):
-        known = {"name": label, "valueReference": str(number), "causality": causality}
-        if causality == "local":
-            known["initial"] = "exact"
-        real = {"start": None if start is None else repr(start), "unit": symbol or None}
-        real = {key: value for key, value in real.items() if value is not None}
-        if version == 2:
-            ElementTree.SubElement(
-                ElementTree.SubElement(listed, "ScalarVariable", known), "Real", real
-            )
-        else:
-            ElementTree.SubElement(listed, "Float64", known | real)
-    if version == 3:
-        known = {"name": _free("time", e), "causality": "independent", "variability": "continuous"}
-        ElementTree.SubElement(listed, "Float64", known, valueReference=str(len(_variables(e))))
-    _structure(ElementTree.SubElement(root, "ModelStructure"), e, version)
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
-
-
-def _structure(root: ElementTree.Element, e: Equations, version: int) -> None:
-    """Which inputs each output depends on, and at the beginning which states."""
-    M, nu, ny = e.matrices, len(e.inputs), len(e.outputs)
-    by_w = (M.Dyw != 0).any(axis=1)[:, None] & (M.Dzu != 0).any(axis=0)
-    by_u = (M.Dyu != 0) | by_w
-    for at_first in (False, True):
-        part = "InitialUnknown" if at_first else "Output"
-        under = ElementTree.SubElement(root, f"{part}s") if version == 2 else root
-        for output in range(ny):
-            known = np.flatnonzero(by_u[output]).tolist()
-            if at_first:
-                known += range(nu + ny, nu + ny + e.sizes["nx"])
-            number, first = nu + output, 1 if version == 2 else 0  # FMI 2 counts from 1
-            key = "index" if version == 2 else "valueReference"
-            depends = {"dependencies": " ".join(str(one + first) for one in known)}
-            place = {key: str(number + first)} | depends
-            ElementTree.SubElement(under, "Unknown" if version == 2 else part, place)
-
-
-def _free(name: str, e: Equations) -> str:
-    """A name that no variable has."""
-    while name in {label for label, *_ in _variables(e)}:
-        name += "_"
-    return name
-
-
 def _variables(e: Equations) -> list[tuple[str, str, str, float | None]]:
-    """Name, unit, causality and start of each variable, in the order of the value references."""
+    """Name, unit, causality and start of each variable, by value reference; the time is last."""
     starts = e.u_offset.tolist()
     found: list[tuple[str, str, str, float | None]] = [
         *((c.name, c.unit, "input", start) for c, start in zip(e.inputs, starts, strict=True)),
         *((c.name, c.unit, "output", None) for c in e.outputs),
         *((f"x[{i + 1}]", "", "local", 0.0) for i in range(e.sizes["nx"])),
+        ("time", "", "independent", None),
     ]
     named: dict[str, tuple[str, str, str, float | None]] = {}
     for label, symbol, causality, start in found:

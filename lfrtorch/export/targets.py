@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from lfrtorch._support import checkpoint
 from lfrtorch._support.arguments import typed
@@ -17,7 +19,7 @@ from lfrtorch.export.c_source import c_source
 from lfrtorch.export.casadi_function import casadi_function, casadi_observer, casadi_reach
 from lfrtorch.export.control_system import python_source
 from lfrtorch.export.equations import check_name, equations
-from lfrtorch.export.fmu import write_fmu
+from lfrtorch.export.fmu import fmu
 from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
 from lfrtorch.linear.model import LinearModel
@@ -29,21 +31,15 @@ class Target(NamedTuple):
     """One kind of export.
 
     Args:
-        endings: of the files NAME.h, ..
-        write: model, name and paths -> files there.
-        use: a line of a program that uses it, with {name} and the {path} of the first file.
-        observer: endings of further files with an observer; None if there is no observer.
-            ``write`` then takes one.
-        follow: what ``use`` is with an observer; {path} is the last file.
-        reach: endings of further files of a model that knows the reach of its data.
+        files: model and name -> text or bytes of each file by its name, in their order.
+        use: a line of a program that uses them, with {name} and the {path} of the first file.
+        follow: what ``use`` is with an observer, {path} being the last file; empty if there is no
+            observer. ``files`` takes one then.
     """
 
-    endings: tuple[str, ...]
-    write: Callable[..., object]
+    files: Callable[..., Mapping[str, str | bytes]]
     use: str
-    observer: tuple[str, ...] | None = None
     follow: str = ""
-    reach: tuple[str, ...] = ()
 
     def usage(self, name: str, paths: list[Path], observer: bool | NoiseCovariance) -> str:
         """The line of a program that uses the files, the observer's if there is one."""
@@ -53,102 +49,81 @@ class Target(NamedTuple):
         return self.follow.format(name=name, path=paths[-1], P=P)
 
 
-def _c(
-    model: Model | LinearModel,
-    name: str,
-    paths: list[Path],
-    observer: bool | NoiseCovariance,
-    single: bool = False,
-) -> None:
-    texts = c_source(model, name, observer=observer, single=single)
-    for path, text in zip(paths, texts, strict=True):
-        path.write_text(text, encoding="utf-8")
+def _c(model: Model | LinearModel, name: str, **options: Any) -> dict[str, str | bytes]:
+    return dict(zip((f"{name}.h", f"{name}.c"), c_source(model, name, **options), strict=True))
 
 
 def _casadi(
-    model: Model | LinearModel, name: str, paths: list[Path], observer: bool | NoiseCovariance
-) -> None:
-    functions = [casadi_function(model, name)]
-    if isinstance(model, Model) and knows_reach(model):
-        functions.append(casadi_reach(model, name))
+    model: Model | LinearModel, name: str, observer: bool | NoiseCovariance
+) -> dict[str, str | bytes]:
+    e = equations(model)
+    found: dict[str, Any] = {".casadi": casadi_function(model, name)}
+    found["_channels.json"] = json.dumps(e.description(name), indent=2) + "\n"
+    if e.distance is not None:
+        found["_reach.casadi"] = casadi_reach(model.to_model(), name)
     if observer is not False:
-        functions += casadi_observer(model, name, observer=observer)
-    for function, path in zip(functions, [paths[0], *paths[2:]], strict=True):
-        function.save(str(path))
-    paths[1].write_text(json.dumps(equations(model).description(name), indent=2) + "\n")
+        names = "_predict.casadi", "_correct.casadi", "_update.casadi"
+        found |= zip(names, casadi_observer(model, name, observer=observer), strict=True)
+    return {f"{name}{end}": _saved(each) for end, each in found.items()}
 
 
-def knows_reach(model: Model | LinearModel) -> bool:
-    """Whether a model tells how far the data of its fit went in its static map."""
-    return isinstance(model, Model) and model.reach is not None and model.lfr.cell.nz > 0
+def _saved(function: Any) -> str | bytes:
+    """What CasADi saves of a function; a text as it is."""
+    if isinstance(function, str):
+        return function
+    with tempfile.TemporaryDirectory() as folder:
+        function.save(str(path := Path(folder) / "saved"))
+        return path.read_bytes()
 
 
-def _onnx(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
-    for path, graph in zip(paths, onnx_models(model, name), strict=True):
-        path.write_bytes(graph.SerializeToString())
+def _onnx(model: Model | LinearModel, name: str) -> dict[str, str | bytes]:
+    sample, simulation = (graph.SerializeToString() for graph in onnx_models(model, name))
+    return {f"{name}.onnx": sample, f"{name}_simulate.onnx": simulation}
 
 
 def _matlab(
-    model: Model | LinearModel, name: str, paths: list[Path], observer: bool | NoiseCovariance
-) -> None:
+    model: Model | LinearModel, name: str, observer: bool | NoiseCovariance
+) -> dict[str, str | bytes]:
     from scipy.io import savemat
 
     texts, variables = matlab_function(model, name, observer=observer)
-    savemat(paths[1], variables)
-    for path, text in zip([paths[0], *paths[2:]], texts.values(), strict=True):
-        path.write_text(text, encoding="utf-8")
+    savemat(file := io.BytesIO(), variables)
+    first = f"{name}.m"
+    return {first: texts.pop(first), f"{name}.mat": file.getvalue(), **texts}
 
+
+def _fmu(model: Model | LinearModel, name: str, version: int) -> dict[str, str | bytes]:
+    return {f"{name}.fmu": fmu(model, name, version)}
+
+
+_IN_C = (
+    "{name}_step(x, u, x_next, y);",
+    "{name}_observer_correct(&observer, u, y); {name}_observer_advance(&observer, u);",
+)
 
 TARGETS = {
-    "c": Target(
-        (".h", ".c"),
-        _c,
-        "{name}_step(x, u, x_next, y);",
-        (),
-        "{name}_observer_correct(&observer, u, y); {name}_observer_advance(&observer, u);",
-    ),
-    "c_float": Target(
-        (".h", ".c"),
-        partial(_c, single=True),
-        "{name}_step(x, u, x_next, y);",
-        (),
-        "{name}_observer_correct(&observer, u, y); {name}_observer_advance(&observer, u);",
-    ),
+    "c": Target(_c, *_IN_C),
+    "c_float": Target(partial(_c, single=True), *_IN_C),
     "casadi": Target(
-        (".casadi", "_channels.json"),
         _casadi,
         "x_next, y = casadi.Function.load('{path}')(x, u)",
-        ("_predict.casadi", "_correct.casadi", "_update.casadi"),
         "after = casadi.Function.load('{path}')(x=x, u=u, y=y{P})",
-        ("_reach.casadi",),
     ),
     "onnx": Target(
-        (".onnx", "_simulate.onnx"),
         _onnx,
         "x_next, y = onnxruntime.InferenceSession('{path}').run(None, {{'x': x, 'u': u}})",
     ),
     "matlab": Target(
-        (".m", ".mat", "_lpv.m", "_numbers.m"),
         _matlab,
         "[x_next, y] = {name}(x, u)",
-        ("_start.m", "_correct.m", "_advance.m"),
         "s = {name}_correct(s, u, y); s = {name}_advance(s, u);",
     ),
     "control": Target(
-        (".py",),
-        lambda model, name, paths: paths[0].write_text(python_source(model, name), "utf-8"),
+        lambda model, name: {f"{name}.py": python_source(model, name)},
         "from {name} import system",
     ),
-    "fmu": Target(
-        (".fmu",),
-        lambda model, name, paths: write_fmu(model, paths[0], name),
-        "found = fmpy.simulate_fmu('{path}')",
-    ),
-    "fmu3": Target(
-        (".fmu",),
-        lambda model, name, paths: write_fmu(model, paths[0], name, version=3),
-        "found = fmpy.simulate_fmu('{path}')",
-    ),
+    "fmu": Target(partial(_fmu, version=2), "found = fmpy.simulate_fmu('{path}')"),
+    "fmu3": Target(partial(_fmu, version=3), "found = fmpy.simulate_fmu('{path}')"),
 }
 """All kinds of export."""
 
@@ -207,23 +182,21 @@ def write(
             )
         model = model.to_model()
         model, observer = model.with_disturbance(disturbance, observer)
-    target, given = TARGETS[to], {}
-    endings = target.endings + (target.reach if knows_reach(model) else ())
-    if target.observer is not None:
-        given = {"observer": observer}
-        endings += () if observer is False else target.observer
-    elif observer is not False:
-        known = ", ".join(name for name, each in TARGETS.items() if each.observer is not None)
+    target = TARGETS[to]
+    if not target.follow and observer is not False:
+        known = ", ".join(name for name, each in TARGETS.items() if each.follow)
         raise InputError(f"there is no observer for to={to!r}; give one of {known}.")
     if (Path(folder) / checkpoint.DESCRIPTION).is_file():
         raise InputError(
             f"'{folder}' is a checkpoint, which holds nothing else; give another folder."
         )
-    paths = [Path(folder) / f"{name}{ending}" for ending in endings]
+    files = target.files(model, name, **({"observer": observer} if target.follow else {}))
+    paths = [Path(folder) / file for file in files]
     if not overwrite:
         for path in paths:
             refuse_existing(path, "overwrite=True")
     with ExitStack() as all_or_none:
-        whole = [all_or_none.enter_context(whole_file(p)) for p in paths]
-        target.write(model, name, whole, **given)
+        whole = [all_or_none.enter_context(whole_file(path)) for path in paths]
+        for path, content in zip(whole, files.values(), strict=True):
+            path.write_bytes(content if isinstance(content, bytes) else content.encode())
     return paths

@@ -363,6 +363,31 @@ Status {{ fmi }}{{ "DeSerialize" if version == 2 else "Deserialize" }}{{ State }
     memcpy(*state, bytes, sizeof(State));
     return OK;
 }
+{# Types of variables that there are none of, and functions that no unit for co-simulation of a
+   sampled model needs. #}
+{% if version == 2 %}
+{% set others = ["Integer", "Boolean", "String"] %}
+{% set unsupported = [
+    "CancelStep", "GetStatus", "GetRealStatus", "GetIntegerStatus", "GetBooleanStatus",
+    "GetStringStatus", "SetRealInputDerivatives", "GetRealOutputDerivatives",
+] %}
+{% else %}
+{% set others = [
+    "Float32", "Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64",
+    "Boolean", "String", "Binary", "Clock",
+] %}
+{% set unsupported = [
+    "GetNumberOfVariableDependencies", "GetVariableDependencies", "GetAdjointDerivative",
+    "EnterConfigurationMode", "ExitConfigurationMode", "EnterEventMode", "EnterStepMode",
+    "GetIntervalDecimal", "GetIntervalFraction", "GetShiftDecimal", "GetShiftFraction",
+    "SetIntervalDecimal", "SetIntervalFraction", "SetShiftDecimal", "SetShiftFraction",
+    "EvaluateDiscreteStates", "UpdateDiscreteStates", "EnterContinuousTimeMode",
+    "CompletedIntegratorStep", "SetTime", "SetContinuousStates",
+    "GetContinuousStateDerivatives", "GetEventIndicators", "GetContinuousStates",
+    "GetNominalsOfContinuousStates", "GetNumberOfEventIndicators",
+    "GetNumberOfContinuousStates", "GetOutputDerivatives", "ActivateModelPartition",
+] %}
+{% endif %}
 {% for kind in others %}
 
 Status {{ fmi }}Get{{ kind }}(void *c, const unsigned references[], size_t count)
