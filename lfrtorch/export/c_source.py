@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from lfrtorch._support.types import Array
-from lfrtorch.export.equations import (
-    Equations,
-    KalmanNoise,
-    SteadyGain,
-    check_name,
-    equations,
-    observer_equations,
-)
+from lfrtorch.export.equations import check_name, equations, observer_equations
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.formula_code import PYTHON, statements, with_slopes
 from lfrtorch.maps.operations import Formula
@@ -72,21 +65,7 @@ def c_source(
     e = equations(model)
     known: dict[str, Any] = {"ts": repr(1.0 / e.fs), "about": _comment(e.about(name))}
     known |= {"constant": _constant, "pairs": _pairs, "operations": _operations}
-    known["arrays"] = list(_arrays(e))
-    if e.distance is not None:
-        known["distance"] = True
-        for symbol, size, value in zip("Tt", ("NZ * NZ", "NZ"), e.distance, strict=True):
-            known["arrays"].append(_constant(f"reach_{symbol}", size, value))
-    match observer_equations(model, observer):
-        case SteadyGain(K=K):
-            known["K"] = True
-            known["arrays"].append(_constant("K", "NX * NY", K))
-        case KalmanNoise(G=G, U=U):
-            known["G"] = True
-            known["arrays"].append("/* G times G transposed: covariance of y's and x's noise. */")
-            known["arrays"].append(_constant("G", "NG * NG", G))
-            known["arrays"].append("/* U0 times U0 transposed: covariance of x in the data. */")
-            known["arrays"].append(_constant("U0", "NX * NX", U))
+    known["roots"] = observer_equations(model, observer).roots
     header, source = (e.rendered(file, name, **known) for file in ("model.h", "model.c"))
     return (_single(header), _single(source)) if single else (header, source)
 
@@ -124,18 +103,6 @@ def _single(text: str) -> str:
         number = r"(?<![\w.])(\d+\.\d+(?:e[+-]?\d+)?|\d+e[+-]?\d+)"
         parts[i] = re.sub(number, r"\1f", parts[i])
     return "".join(parts)
-
-
-def _arrays(e: Equations) -> Iterator[str]:
-    """All constants but those of the static map, as the equations name them."""
-    sizes = {
-        "u_offset": "NU", "y_offset": "NY", "x_rest": "NX", "A": "NX * NX", "Bu": "NX * NU",
-        "Bw": "NX * NW", "Cz": "NZ * NX", "Dzu": "NZ * NU", "Cy": "NY * NX", "Dyu": "NY * NU",
-        "Dyw": "NY * NW",
-    }  # fmt: skip
-    for name, size in sizes.items():
-        if e.arrays[name].size:
-            yield _constant(name, size, e.arrays[name])
 
 
 def _constant(name: str, size: str, value: Array) -> str:

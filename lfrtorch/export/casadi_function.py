@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
-from lfrtorch.export.equations import KalmanNoise, check_name, equations, observer_equations
+from lfrtorch.export.equations import check_name, equations, observer_equations
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.operations import Formula
 from lfrtorch.model.extended_kalman_filter import NoiseCovariance
@@ -49,14 +50,8 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
     e = equations(model)
     x = ca.SX.sym("x", e.sizes["nx"])
     u = ca.vertcat(*(ca.SX.sym(channel.name) for channel in e.inputs))
-    v = u - e.u_offset
-    M = e.matrices
-    x_next, y = ca.mtimes(M.A, x) + ca.mtimes(M.Bu, v), ca.mtimes(M.Cy, x) + ca.mtimes(M.Dyu, v)
-    if e.map.nw:
-        z = ca.mtimes(M.Cz, x) + ca.mtimes(M.Dzu, v)
-        w = e.written.of(_Expressions(ca, e.weights), z)
-        x_next, y = x_next + ca.mtimes(M.Bw, w), y + ca.mtimes(M.Dyw, w)
-    return ca.Function(name, [x, u], [x_next, y + e.y_offset], ["x", "u"], ["x_next", "y"])
+    made = e.sample(_Expressions(ca, e.arrays), x, u)
+    return ca.Function(name, [x, u], made, ["x", "u"], ["x_next", "y"])
 
 
 def casadi_reach(model: Model, name: str = "model") -> Any:
@@ -85,8 +80,8 @@ def casadi_reach(model: Model, name: str = "model") -> Any:
             "the reach of the data is not known; give model.reaching(records), of an NL-LFR."
         )
     x, u = ca.SX.sym("x", e.sizes["nx"]), ca.SX.sym("u", e.sizes["nu"])
-    T, t = e.distance
-    z = ca.mtimes(e.matrices.Cz, x) + ca.mtimes(e.matrices.Dzu, u - e.u_offset)
+    (T, t), language = e.distance, _Expressions(ca, e.arrays)
+    z = language.total("z", {"Cz": x, "Dzu": language.deviation(u)})
     square = ca.sumsqr(ca.mtimes(T, z) - t)
     return ca.Function(f"{name}_reach", [x, u], [square], ["x", "u"], ["reach"])
 
@@ -133,7 +128,7 @@ def casadi_observer(
         True
     """
     ca = imported("casadi", "casadi")
-    found, step = observer_equations(model, observer), casadi_function(model, name)
+    found, step = observer_equations(model, observer).covariances, casadi_function(model, name)
     nx, ny = step.size1_in("x"), step.size1_out("y")
     x, u = step.sx_in()
     y, missing = ca.SX.sym("y", ny), ca.SX.sym("missing", ny)
@@ -147,13 +142,12 @@ def casadi_observer(
         options = {"default_in": default[: len(given)]}
         return ca.Function(f"{name}_{kind}", given, made, names, named, options)
 
-    if not isinstance(found, KalmanNoise):
-        assert found is not None
-        made = [x_next + ca.mtimes(found.K, e)]
+    if "K" in found:
+        made = [x_next + ca.mtimes(found["K"], e)]
         return predict, function("correct", [x], ["x_known"]), function("update", made, ["x_next"])
     given.append(ca.SX.sym("P", nx, nx))
-    P, joint = ca.if_else(given[-1] < np.inf, given[-1], found.U @ found.U.T), found.G @ found.G.T
-    Q, S, R = joint[ny:, ny:], joint[ny:, :ny], joint[:ny, :ny]
+    Q, S, R, P0 = found.values()
+    P = ca.if_else(given[-1] < np.inf, given[-1], P0)
     # A missing output has a row of zeros in H, and noise of its own alone.
     known = ca.diag(1.0 - missing)
     H, R, S = (
@@ -177,15 +171,24 @@ def casadi_observer(
 
 
 class _Expressions:
-    """Columns of CasADi, and the arrays of the static map that act on them."""
+    """Columns of CasADi, and the arrays that act on them."""
 
     def __init__(self, ca: Any, arrays: Mapping[str, Array]) -> None:
         self.ca, self.arrays, self.operations = ca, arrays, _operations(ca)
 
+    def deviation(self, u: Any) -> Any:
+        """u - u_offset."""
+        return u - self.arrays["u_offset"]
+
+    def total(self, to: str, terms: Mapping[str, Any], offset: str = "") -> Any:
+        """Sum of matrices times signals and perhaps an offset."""
+        products = (self.ca.mtimes(self.arrays[M], signal) for M, signal in terms.items())
+        found = reduce(operator.add, products)
+        return found + self.arrays[offset] if offset else found
+
     def affine(self, W: str, v: Any, b: str = "") -> Any:
         """W v + b."""
-        product = self.ca.mtimes(self.arrays[W], v)
-        return product + self.arrays[b] if b else product
+        return self.total("", {W: v}, b)
 
     def each(self, sigma: Formula, v: Any) -> Any:
         """A function of one number, of every entry of v."""

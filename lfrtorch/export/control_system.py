@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 from lfrtorch._support.optional import imported
-from lfrtorch.export.equations import Equations, check_name, equations
+from lfrtorch.export.equations import check_name, equations
 from lfrtorch.linear.control import control_labels
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.formula_code import PYTHON, statements
@@ -76,15 +75,8 @@ def python_source(model: Model | LinearModel, name: str = "model") -> str:
     e = equations(model)
     sides = {"inputs": e.inputs, "outputs": e.outputs}
     labels = {side: control_labels(channels) for side, channels in sides.items()}
-    known = {"about": e.about(name), "arrays": _arrays(e), "fs": float(e.fs), "labels": labels}
+    known = {"about": e.about(name), "fs": float(e.fs), "labels": labels}
     return e.rendered("model_py.txt", name, **known, **sides, statements=_statements, repr=repr)
-
-
-def _arrays(e: Equations) -> Iterator[tuple[str, str | list[str]]]:
-    """Names and rows of all constants."""
-    for name, value in e.arrays.items():
-        if value.size:
-            yield name, str(value.tolist()) if value.ndim == 1 else [*map(str, value.tolist())]
 
 
 def _statements(formula: Formula, name: str) -> tuple[list[tuple[str, str]], list[str]]:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -21,10 +21,22 @@ from lfrtorch.engine.cell import Matrices
 from lfrtorch.engine.operating_point import double, equilibrium
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.static_map import StaticMap
-from lfrtorch.maps.written import Written
+from lfrtorch.maps.written import Vectors, Written
 from lfrtorch.model.data_reach import DataReach
 from lfrtorch.model.extended_kalman_filter import NoiseCovariance, data_root
 from lfrtorch.model.model import NO_OBSERVER, Model
+
+
+class Signals(Vectors, Protocol):
+    """A language of vectors that knows all arrays of a model."""
+
+    def deviation(self, u: Any) -> Any:
+        """u - u_offset."""
+        ...
+
+    def total(self, to: str, terms: Mapping[str, Any], offset: str = "") -> Any:
+        """Sum of matrices times signals and perhaps an offset, called ``to``."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +138,15 @@ class Equations:
         T = self.reach.z.axes / self.reach.z.farthest
         return T, T @ self.reach.z.middle
 
+    def sample(self, language: Signals, x: Any, u: Any) -> tuple[Any, Any]:
+        """x+ and y of x and u in a language of expressions."""
+        v = language.deviation(u)
+        x_next, y = {"A": x, "Bu": v}, {"Cy": x, "Dyu": v}
+        if self.map.nw:
+            w = self.written.of(language, language.total("z", {"Cz": x, "Dzu": v}))
+            x_next["Bw"], y["Dyw"] = w, w
+        return language.total("x_next", x_next), language.total("y", y, "y_offset")
+
     def rendered(self, template: str, name: str, **more: Any) -> str:
         """A text of this room's folder ``templates`` for the model, and ``more`` that it has."""
         import jinja2
@@ -136,7 +157,8 @@ class Equations:
         )  # fmt: skip
         known = {"name": name, "NAME": name.upper(), "rest": self.x_rest.size, **self.sizes}
         known |= {"map": self.map, "written": self.written, "weights": self.weights}
-        known |= {"feedthrough": self.feedthrough}
+        known |= {"feedthrough": self.feedthrough, "arrays": self.arrays}
+        known["distance"] = self.distance
         return environment.get_template(template).render(known | more)
 
 
@@ -207,34 +229,32 @@ def numbers(weight: Tensor) -> Array:
     return weight.detach().cpu().double().numpy()
 
 
-@dataclass(frozen=True, eq=False)
-class SteadyGain:
-    """x+ = f(x, u) + K (y - y_hat), K: (nx, ny)."""
+class Observer(NamedTuple):
+    """The numbers of an observer by name, with covariances as roots of them or as they are.
 
-    K: Array
+    K (nx, ny) of x+ = f(x, u) + K (y - y_hat) is in both. A filter has G with G Gᵀ = [R Sᵀ; S Q]
+    and U0 with U0 U0ᵀ = P0, of the states in the data; or Q, S, R and P0. No observer has nothing.
+    """
 
-
-@dataclass(frozen=True, eq=False)
-class KalmanNoise:
-    """G Gᵀ = [R Sᵀ; S Q], (ny + nx) squared, and U Uᵀ = P0, (nx, nx): of the states in the data."""
-
-    G: Array
-    U: Array
+    roots: dict[str, Array]
+    covariances: dict[str, Array]
 
 
-def observer_equations(
-    model: Model | LinearModel, observer: bool | NoiseCovariance
-) -> SteadyGain | KalmanNoise | None:
-    """Gain or noise of an observer; None for no observer."""
+def observer_equations(model: Model | LinearModel, observer: bool | NoiseCovariance) -> Observer:
+    """Gain or noise of an observer."""
     if observer is False:
-        return None
+        return Observer({}, {})
     model = model.to_model()
     if isinstance(observer, NoiseCovariance):
-        cell = model.lfr.cell
-        return KalmanNoise(observer.root(cell.nx, cell.ny), data_root(cell))
+        cell, ny = model.lfr.cell, model.lfr.cell.ny
+        G, U = observer.root(cell.nx, ny), data_root(cell)
+        joint = G @ G.T
+        parts = {"Q": joint[ny:, ny:], "S": joint[ny:, :ny], "R": joint[:ny, :ny], "P0": U @ U.T}
+        return Observer({"G": G, "U0": U}, parts)
     if model.K is None:
         raise InputError(NO_OBSERVER)
-    return SteadyGain(np.ascontiguousarray(numbers(model.K) / model.scaler.y_scale))
+    gain = {"K": np.ascontiguousarray(numbers(model.K) / model.scaler.y_scale)}
+    return Observer(gain, gain)
 
 
 _RESERVED = {

@@ -9,13 +9,7 @@ import numpy as np
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.lpv_form import lpv
-from lfrtorch.export.equations import (
-    KalmanNoise,
-    SteadyGain,
-    check_name,
-    equations,
-    observer_equations,
-)
+from lfrtorch.export.equations import check_name, equations, observer_equations
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.extended_kalman_filter import NoiseCovariance
 from lfrtorch.model.model import Model
@@ -75,14 +69,9 @@ def matlab_function(
         found[f"{side}_names"] = np.array([c.name for c in channels], dtype=object)[:, None]
         found[f"{side}_units"] = np.array([c.unit for c in channels], dtype=object)[:, None]
     known: dict[str, Any] = {"about": e.about(name, "{0}({2})"), "schedule": form.schedule}
-    match observer_equations(model, observer):
-        case SteadyGain(K=K):
-            known["K"], literals["K"] = True, K
-        case KalmanNoise(G=G, U=U):
-            ny, joint = e.sizes["ny"], G @ G.T
-            known["G"] = True
-            literals |= {"Q": joint[ny:, ny:], "S": joint[ny:, :ny], "R": joint[:ny, :ny]}
-            literals["P0"] = U @ U.T
+    numbers = observer_equations(model, observer)
+    known |= dict.fromkeys(numbers.roots, True)
+    literals |= numbers.covariances
     found["lpv"] = {letter: np.moveaxis(getattr(form, letter), 0, -1) for letter in "ABCD"}
     points = {"x0": form.x0, "u0": form.u0, "x_next0": form.x_next0, "y0": form.y0}
     found["lpv"] |= {letters: value[:, None] for letters, value in points.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from typing import Any
@@ -54,10 +54,23 @@ def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, A
     """
     check_name(name)
     e = equations(model, _own)
+    nx, nu, ny = (e.sizes[size] for size in ("nx", "nu", "ny"))
     graph = Graph(imported("onnx", "onnx"), e.arrays)
-    _sample(e, graph)
-    sample, simulation = graph.sample(e, name), graph.simulation(e, name)
-    return graph.model(sample, e, name), graph.model(simulation, e, name)
+    e.sample(graph, "x", "u")
+
+    def sample(called: str) -> Any:
+        """x, u -> x_next, y."""
+        ends = {"x": ["n", nx], "u": ["n", nu]}, {"x_next": ["n", nx], "y": ["n", ny]}
+        return graph.of(called, graph.nodes, *ends, graph.constants.values())
+
+    # x0, u -> x_end, y, with the sample as the body of a Scan over the axis of time.
+    scan = graph.onnx.helper.make_node(
+        "Scan", ["x0", "u"], ["x_end", "y"], body=sample(f"{name}_sample"),
+        num_scan_inputs=1, scan_input_axes=[1], scan_output_axes=[1],
+    )  # fmt: skip
+    ends = {"x0": ["n", nx], "u": ["n", "T", nu]}, {"x_end": ["n", nx], "y": ["n", "T", ny]}
+    simulation = graph.of(name, [scan], *ends)
+    return graph.model(sample(name), e, name), graph.model(simulation, e, name)
 
 
 def _own(static: Module, nz: int) -> Written:
@@ -67,23 +80,6 @@ def _own(static: Module, nz: int) -> Written:
         return graph.spliced(traced(static, nz), "f_", z)
 
     return Written("", {}, of)
-
-
-def _sample(e: Equations, graph: Graph) -> None:
-    """The nodes from x and u to x_next and y."""
-    v = graph.node("Sub", "u", graph.constant("u_offset", e.u_offset), to="v")
-
-    def combined(to: str, matrices: dict[str, str], *offset: str) -> str:
-        """Sum of matrices times signals, which are rows, and perhaps an offset."""
-        terms = [graph.product(letters, signal) for letters, signal in matrices.items()]
-        return graph.node("Sum", *terms, *offset, to=to)
-
-    x_next, y = {"A": "x", "Bu": v}, {"Cy": "x", "Dyu": v}
-    if e.map.nw:
-        w = e.written.of(graph, combined("z", {"Cz": "x", "Dzu": v}))
-        x_next["Bw"], y["Dyw"] = w, w
-    combined("x_next", x_next)
-    combined("y", y, graph.constant("y_offset", e.y_offset))
 
 
 _NAMES = {
@@ -99,6 +95,10 @@ _NAMES = {
 """Operations of formulas as operators."""
 
 
+Ends = Mapping[str, Sequence[int | str]]
+"""Signals of a graph with their shapes."""
+
+
 class Graph:
     """Nodes and constants that become a model of ONNX."""
 
@@ -106,6 +106,16 @@ class Graph:
         self.onnx, self.arrays = onnx, arrays
         self.nodes: list[Any] = []
         self.constants: dict[str, Any] = {}
+
+    def deviation(self, u: str) -> str:
+        """u - u_offset."""
+        return self.node("Sub", u, self.constant("u_offset", self.arrays["u_offset"]), to="v")
+
+    def total(self, to: str, terms: Mapping[str, str], offset: str = "") -> str:
+        """Sum of matrices times signals, which are rows, and perhaps an offset."""
+        constant = [self.constant(offset, self.arrays[offset])] if offset else []
+        products = [self.product(M, signal) for M, signal in terms.items()]
+        return self.node("Sum", *products, *constant, to=to)
 
     def product(self, M: str, signal: str) -> str:
         """An array times a signal, which is a row."""
@@ -173,30 +183,13 @@ class Graph:
         self.constants |= {one.name: one for one in added.initializer}
         return f"{prefix}w"
 
-    def signal(self, name: str, *shape: int | str) -> Any:
-        """An input or an output of float64."""
-        kind = self.onnx.TensorProto.DOUBLE
-        return self.onnx.helper.make_tensor_value_info(name, kind, shape)
-
-    def sample(self, e: Equations, name: str) -> Any:
-        """x, u -> x_next, y."""
-        nx, nu, ny = (e.sizes[size] for size in ("nx", "nu", "ny"))
-        inputs = [self.signal("x", "n", nx), self.signal("u", "n", nu)]
-        outputs = [self.signal("x_next", "n", nx), self.signal("y", "n", ny)]
-        return self.onnx.helper.make_graph(
-            self.nodes, name, inputs, outputs, list(self.constants.values())
-        )
-
-    def simulation(self, e: Equations, name: str) -> Any:
-        """x0, u -> x_end, y, with the sample as the body of a Scan over the axis of time."""
-        nx, nu, ny = (e.sizes[size] for size in ("nx", "nu", "ny"))
-        scan = self.onnx.helper.make_node(
-            "Scan", ["x0", "u"], ["x_end", "y"], body=self.sample(e, f"{name}_sample"),
-            num_scan_inputs=1, scan_input_axes=[1], scan_output_axes=[1],
-        )  # fmt: skip
-        inputs = [self.signal("x0", "n", nx), self.signal("u", "n", "T", nu)]
-        outputs = [self.signal("x_end", "n", nx), self.signal("y", "n", "T", ny)]
-        return self.onnx.helper.make_graph([scan], name, inputs, outputs)
+    def of(
+        self, name: str, nodes: Sequence[Any], inputs: Ends, outputs: Ends, constants: Any = ()
+    ) -> Any:
+        """A graph whose inputs and outputs are of float64."""
+        kind, value = self.onnx.TensorProto.DOUBLE, self.onnx.helper.make_tensor_value_info
+        ends = ([value(n, kind, s) for n, s in side.items()] for side in (inputs, outputs))
+        return self.onnx.helper.make_graph(nodes, name, *ends, [*constants])
 
     def model(self, graph: Any, e: Equations, name: str) -> Any:
         """A graph with its operators' version and the metadata."""

@@ -1,3 +1,4 @@
+{% set K, G = "K" in roots, "G" in roots %}
 /* See {{ name }}.h. */
 #include "{{ name }}.h"
 
@@ -17,9 +18,27 @@ enum {
 {% endif %}
 };
 
-{% for array in arrays %}
-{{ array }}
+{% set sizes = {
+    "u_offset": "NU", "y_offset": "NY", "x_rest": "NX", "A": "NX * NX", "Bu": "NX * NU",
+    "Bw": "NX * NW", "Cz": "NZ * NX", "Dzu": "NZ * NU", "Cy": "NY * NX", "Dyu": "NY * NU",
+    "Dyw": "NY * NW",
+} %}
+{% for array, size in sizes.items() if arrays[array].size %}
+{{ constant(array, size, arrays[array]) }}
 {% endfor %}
+{% if distance %}
+{{ constant("reach_T", "NZ * NZ", distance[0]) }}
+{{ constant("reach_t", "NZ", distance[1]) }}
+{% endif %}
+{% if K %}
+{{ constant("K", "NX * NY", roots.K) }}
+{% endif %}
+{% if G %}
+/* G times G transposed: covariance of y's and x's noise. */
+{{ constant("G", "NG * NG", roots.G) }}
+/* U0 times U0 transposed: covariance of x in the data. */
+{{ constant("U0", "NX * NX", roots.U0) }}
+{% endif %}
 
 /* to += M v, with M of rows x columns. */
 static void add(double *to, const double *M, const double *v, int rows, int columns)

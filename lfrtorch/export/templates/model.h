@@ -1,3 +1,4 @@
+{% set K, G = "K" in roots, "G" in roots %}
 {{ about }}
 #ifndef {{ NAME }}_H
 #define {{ NAME }}_H
