@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.data.dataset import Dataset, Published
+from lfrtorch.data.dataset import Dataset
 from lfrtorch.data.records import Record
 from lfrtorch.datasets import official
 
@@ -52,19 +52,6 @@ _TEST_OFFSET = 2000  # seed of the simulated multisine test, beyond the training
 _FILES = "BoucWen/BoucWenFiles/Test signals/Validation signals"  # below the benchmarks' folder
 
 _LOADER = "not_splitted_benchmarks.BoucWen"
-
-_PAPER = "Schoukens and Tóth (2020), table 1"
-_PUBLISHED = (
-    Published("linear (paper)", {"multisine": 15.8e-5, "sweep": 17.7e-5}, _PAPER),
-    Published("NL-LFR (paper)", {"multisine": 5.31e-5, "sweep": 4.19e-5}, _PAPER, (1, 1)),
-    Published("NL-LFR (paper)", {"multisine": 0.72e-5, "sweep": 0.32e-5}, _PAPER, (2, 1)),
-    Published("NL-LFR (paper)", {"multisine": 0.74e-5, "sweep": 0.56e-5}, _PAPER, (2, 2)),
-    Published(
-        "decoupled PNLSS",
-        {"multisine": 1.34e-5, "sweep": 1.12e-5},
-        "Fakhrizadeh Esfahani et al. (2018)",
-    ),
-)
 
 
 def load(
@@ -148,7 +135,7 @@ def load(
         tests=_tests(folder, seed + _TEST_OFFSET),
         noise_rms=noise_rms,
         seed=seed,
-        published=_PUBLISHED,
+        published=official.published("boucwen"),
     )
 
 

@@ -35,17 +35,6 @@ _SAMPLES = 1024  # of each record
 _MOST = 10.0  # V, of the sensor
 _WINDOW = 50  # samples that the package leaves unscored
 
-_PUBLISHED = official.published(
-    ("test",),
-    ("pNARX", (0.416,), official.BOARD),
-    ("SUBNET", (0.37,), official.BOARD),
-    ("TSEM", (0.33,), official.BOARD),
-    ("CT-SUBNET", (0.306,), official.BOARD),
-    ("B-splines", (0.30,), f"{official.LEGACY}; tensor"),
-    ("LTC", (0.298,), "closed-form liquid network, mean of 2, 0.271 to 0.381 V"),
-    ("grey box", (0.221,), f"{official.BOARD}; normalised, neural state space (2025)"),
-)
-
 
 def load(
     *,
@@ -111,5 +100,5 @@ def load(
         validation=chosen,
         tests=[record("test", test_u, test_y, skip)],
         leaderboard=[record("test", test_u, test_y, _WINDOW)],
-        published=_PUBLISHED,
+        published=official.published("cascaded_tanks"),
     )

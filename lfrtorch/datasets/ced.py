@@ -37,15 +37,6 @@ _SITE = "_site"  # at the end of the name of a test as the site cuts it
 _LEVELS = {"low": ("u11", "z11"), "high": ("u12", "z12")}
 
 
-_PUBLISHED = official.published(
-    [level + _SITE for level in _LEVELS],
-    ("pNARX", (0.230, 0.137), official.BOARD),
-    ("CT-SUBNET", (0.115, 0.074), official.BOARD),
-    ("GP-NARX", (0.087, 0.070), official.BOARD),
-    ("dynoNet", (0.062, 0.047), f"{official.BOARD} (2024), untuned"),
-)
-
-
 def load(
     *, validation: float = 0.2, download: bool = False, root: str | Path | None = None
 ) -> Dataset:
@@ -97,6 +88,6 @@ def load(
         train=parts(0, trained, "train_", warm_up=0),
         validation=parts(trained, _ESTIMATION, "validation_", warm_up=trained),
         tests=[*parts(scored, _SAMPLES, warm_up=scored), *site],
-        published=_PUBLISHED,
+        published=official.published("ced"),
         leaderboard=site,
     )

@@ -38,17 +38,6 @@ _SAMPLES = 24_841  # of each file
 _WINDOW = 20  # samples, unscored, of the test
 
 
-_PUBLISHED = official.published(
-    ("test",),
-    ("pNARX", (5.18,), official.BOARD),
-    ("CT-SUBNET", (4.61,), official.BOARD),
-    ("LTC", (4.10,), "closed-form liquid network; with noise"),
-    ("CT network", (3.68,), f"{official.LEGACY}; input-output stable"),
-    ("dynoNet", (2.64,), f"{official.LEGACY}; 5.01 mm since"),
-    unit="mm",
-)
-
-
 def load(
     *,
     validation: float = 0.0,
@@ -108,7 +97,7 @@ def load(
         validation=[] if trained == _SAMPLES else [whole_but(trained, "validation")],
         tests=tests,
         selection=[] if trained < _SAMPLES else [whole_but(warm_up, "from the first samples")],
-        published=_PUBLISHED,
+        published=official.published("emps"),
         notes=notes,
         leaderboard=tests,
     )

@@ -34,8 +34,7 @@ from pathlib import Path
 import numpy as np
 
 from lfrtorch._support.errors import InputError
-from lfrtorch.data.dataset import Dataset, Published
-from lfrtorch.data.metrics import rms
+from lfrtorch.data.dataset import Dataset
 from lfrtorch.data.records import Record
 from lfrtorch.datasets import official
 
@@ -47,27 +46,6 @@ _FS = 400.0  # Hz
 _PERIOD, _PERIODS = 8192, 9  # samples of a multisine, and how many; the first is a transient
 _ESTIMATION, _TESTS = (1, 3, 5, 7), (2, 4, 6)  # levels
 _SKIP = 50  # samples, unscored, of records from rest
-
-
-_PUBLISHED = (
-    *official.published(
-        [f"{kind}_{level} acc1" for kind in _KINDS for level in _TESTS],
-        ("ARX", (0.291, 0.502, 0.653, 0.178, 0.306, 0.422), official.BOARD),
-        ("LSTM", (0.122, 0.268, 0.379, 0.0874, 0.187, 0.300), official.BOARD),
-        ("GRU", (0.111, 0.264, 0.383, 0.0876, 0.191, 0.315), official.BOARD),
-        (
-            "modal TCN",
-            (0.0999, 0.1766, 0.2710, 0.0503, 0.1111, 0.1670),
-            "modal FFT backbone with a temporal convolutional network, mean of 8 folds, not "
-            "submitted",
-        ),
-    ),
-    Published(
-        "deep LRU",
-        {"multisine_6": float(rms([0.180, 0.167, 0.368]))},
-        "Forgione et al. (2024); of its 0.180, 0.167 and 0.368 m/s² for the three outputs",
-    ),
-)
 
 _NOTE = "RMSE is that of the three accelerations together; published figures are of acc1 alone"
 
@@ -127,7 +105,7 @@ def load(
         train=fitted,
         validation=chosen_by,
         tests=tests,
-        published=_PUBLISHED,
+        published=official.published("f16"),
         notes=(*notes, _NOTE),
         leaderboard=[replace(test, weight=first) for test in tests],
     )

@@ -43,18 +43,6 @@ _CHANNELS = 3  # inputs, and outputs
 _WINDOW = 100  # samples, unscored, of each period
 
 
-_PUBLISHED = official.published(
-    [f"level_{level}" for level in LEVELS],
-    ("LTI", (0.114, 0.216, 0.228), f"{official.BOARD}; nx 28, a model for each level"),
-    (
-        "freq-statespace",
-        (0.0866, 0.131, 0.169),
-        f"{official.BOARD}; NL-LFR with nx 28, nz 16, nw 8, 128 neurons, a model for all levels",
-    ),
-    unit="µm",
-)
-
-
 def load(
     *,
     levels: Sequence[int] = LEVELS,
@@ -139,7 +127,7 @@ def load(
         train=train,
         validation=chosen_by,
         tests=tests,
-        published=_PUBLISHED,
+        published=official.published("fine_steering_mirror"),
         notes=official.without_tests(missing, why, partly=bool(tests)),
         groups=groups,
         linear={

@@ -35,7 +35,7 @@ from jaxtyping import Float
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.data.dataset import Dataset, Published
+from lfrtorch.data.dataset import Dataset
 from lfrtorch.data.records import Channel, Record
 from lfrtorch.datasets import official
 
@@ -96,17 +96,6 @@ MEASURES = {
 }  # fmt: skip
 """Errors (n, h) of predictions, by what the benchmark calls them."""
 
-_PAPER = "Busetto et al., 2026"
-_PUBLISHED = [
-    Published(label, dict(zip((f"melon {name}" for name in MEASURES), row, strict=True)), _PAPER)
-    for label, *row in (
-        ("physics", 2.322, 10.62, 5.101, 29.09),
-        ("physics + MLP", 2.363, 10.40, 6.153, 28.99),
-        ("MLP", 4.052, 12.58, 6.059, 35.57),
-        ("LSTM", 5.971, 16.72, 5.653, 35.84),
-    )
-]
-
 
 def load(
     *, validation: int = 1, left_out: str | None = None, root: str | Path | None = None
@@ -155,7 +144,7 @@ def load(
         tests=scored,
         groups={left_out or _TEST: tuple(r.name for r in scored)} if scored else {},
         ahead=MEASURES,
-        published=() if left_out else tuple(_PUBLISHED),
+        published=() if left_out else official.published("nanodrone"),
         notes=notes,
     )
 
@@ -169,12 +158,8 @@ def _files(folder: Path, use: str, kind: str) -> list[Path]:
 def _flight(path: Path) -> Record:
     """One file as a record."""
     read = _released if path.suffix == ".csv" else _arrays
-    try:
+    with official.readable(path, _HOLDS[path.suffix]):
         u, y, fs = (np.array(part, dtype=np.float64) for part in read(path))
-    except Exception as error:  # a damaged file makes numpy raise any of several kinds
-        raise InputError(
-            f"'{path}' holds no readable {_HOLDS[path.suffix]} ({error!r}); {official.again(path)}"
-        ) from error
     if u.ndim != 2 or y.ndim != 2 or u.shape[1:] != (4,) or y.shape != (len(u), 12) or len(u) < 2:
         raise InputError(
             f"'{path}' holds u of shape {u.shape} and y of shape {y.shape}; expected (N, 4) and "

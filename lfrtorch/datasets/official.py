@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from io import BytesIO
@@ -125,21 +127,18 @@ def read_arrays(path: Path, shapes: Mapping[str, Shape], member: str = "") -> di
     for name, shape in shapes.items():
         signal = len(shape) == 1
         allowed = ((1, *shape), (*shape, 1)) if signal else (shape,)
-        array = _variable(path, content, name, allowed)
+        with readable(path, f"'{name}'"):
+            array = np.asarray(scipy.io.loadmat(content, variable_names=[name])[name])
+        array = _numbers(path, name, array, allowed)
         found[name] = array.ravel() if signal else array
     return found
 
 
 def read_struct(path: Path, name: str, fields: Sequence[str]) -> list[Array]:
     """Read matrices (samples, records) of one shape from a struct of a .mat file, in this order."""
-    try:
+    with readable(path, f"struct '{name}' with {' and '.join(fields)}"):
         (struct,) = scipy.io.loadmat(path, variable_names=[name])[name].ravel()
         matrices = [np.asarray(struct[field]) for field in fields]
-    except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
-        raise InputError(
-            f"'{path}' holds no readable struct '{name}' with {' and '.join(fields)} ({error!r}); "
-            f"{again(path)}"
-        ) from error
     shape = matrices[0].shape
     if len(shape) != 2 or 0 in shape:
         raise InputError(
@@ -154,11 +153,8 @@ def read_struct(path: Path, name: str, fields: Sequence[str]) -> list[Array]:
 
 def read_npz(path: Path) -> dict[str, Array]:
     """Read all arrays of a .npz file by name; refuse NaN and what is no number."""
-    try:
-        with path.open("rb") as content, np.load(content) as file:
-            found = {name: file[name] for name in file.files}
-    except Exception as error:  # a damaged archive makes for several kinds
-        raise InputError(f"'{path}' is no readable .npz file ({error!r}); {again(path)}") from error
+    with readable(path, "arrays"), path.open("rb") as content, np.load(content) as file:
+        found = {name: file[name] for name in file.files}
     return {name: _numbers(path, name, array, (array.shape,)) for name, array in found.items()}
 
 
@@ -202,19 +198,17 @@ def record(
     return Record(u, y, **given)
 
 
-def published(
-    tests: Sequence[str], *rows: tuple[str, Sequence[float | None], str], unit: str = ""
-) -> tuple[Published, ...]:
-    """Make published results of rows: a label, the RMSE (``unit``) of each test, and the source.
-
-    None stands for an RMSE that is not known; the last tests may be left out.
-    """
-    scale = {"mV": 1e-3, "mm": 1e-3, "µm": 1e-6}.get(unit, 1.0)
+def published(benchmark: str) -> tuple[Published, ...]:
+    """Return the published results of a benchmark, rows of ``published.csv``, in SI units."""
+    with (Path(__file__).parent / "published.csv").open(newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["benchmark"] == benchmark]
     found: list[Published] = []
-    for label, errors, source in rows:
-        known = zip(tests, errors, strict=False)
-        scores = {test: scale * error for test, error in known if error is not None}
-        found.append(Published(label, scores, source, unit=unit))
+    for row in rows:
+        scale = {"mV": 1e-3, "mm": 1e-3, "µm": 1e-6}.get(row["unit"], 1.0)
+        errors = (test.rpartition(" ") for test in row["errors"].split("; "))
+        scores = {test: scale * float(error) for test, _, error in errors}
+        sizes = (int(row["nz"]), int(row["nw"])) if row["nz"] else None
+        found.append(Published(row["result"], scores, row["source"], sizes, row["unit"]))
     return tuple(found)
 
 
@@ -265,25 +259,9 @@ def _download(below: Path, file: str, loader: str) -> None:
 
 def _unpacked(path: Path, member: str) -> BytesIO:
     """The content of a file in a zip archive."""
-    try:
-        with ZipFile(path) as archive:
-            (name,) = (n for n in archive.namelist() if n.rpartition("/")[2] == member)
-            return BytesIO(archive.read(name))
-    except Exception as error:  # a damaged archive, too, makes for several kinds
-        raise InputError(
-            f"'{path}' holds no readable '{member}' ({error!r}); {again(path)}"
-        ) from error
-
-
-def _variable(path: Path, content: Path | BytesIO, name: str, shapes: Sequence[Shape]) -> Array:
-    """A variable of a .mat file with one of the shapes."""
-    try:
-        found = np.asarray(scipy.io.loadmat(content, variable_names=[name])[name])
-    except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
-        raise InputError(
-            f"'{path}' holds no readable '{name}' ({error!r}); {again(path)}"
-        ) from error
-    return _numbers(path, name, found, shapes)
+    with readable(path, f"'{member}'"), ZipFile(path) as archive:
+        (name,) = (n for n in archive.namelist() if n.rpartition("/")[2] == member)
+        return BytesIO(archive.read(name))
 
 
 def _numbers(path: Path, name: str, found: NDArray[Any], shapes: Sequence[Shape]) -> Array:
@@ -301,6 +279,15 @@ def _numbers(path: Path, name: str, found: NDArray[Any], shapes: Sequence[Shape]
             f"{again(path)}"
         )
     return found.astype(np.float64)
+
+
+@contextmanager
+def readable(path: Path, what: str) -> Iterator[None]:
+    """Name the file that is read inside if it is damaged, for which readers have many errors."""
+    try:
+        yield
+    except Exception as error:
+        raise InputError(f"'{path}' holds no readable {what} ({error!r}); {again(path)}") from error
 
 
 def again(path: Path) -> str:

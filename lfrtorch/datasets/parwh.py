@@ -56,31 +56,6 @@ _NOT_FOUND = (
     "(source='official' downloads the data, root=DIR says where they are)"
 )
 
-_PAPER = "Schoukens and Tóth (2020), table 2, official data"
-
-
-_PUBLISHED = official.published(
-    [*(f"level_{level}" for level in LEVELS), "arrow"],
-    (
-        "linear (paper)",
-        (0.83, 9.46, 19.9, 30.7, 37.7, 45.5),
-        f"{_PAPER}; a model for each level, that of 1000 mV for the arrow",
-    ),
-    ("GRU", (1.75, 3.82, 5.61, 7.23, 10.5), official.BOARD),
-    ("NL-LFR (paper)", (0.30, 0.51, 0.72, 1.03, 1.37, 1.42), _PAPER),
-    (
-        "parallel WH",
-        (0.30, 0.50, 0.38, 0.57, 1.10, 2.66),
-        "Schoukens et al. (2015), official data",
-    ),
-    (
-        "NL-LFR, inferred",
-        (0.200, 0.397, 0.412, 0.469, 0.827),
-        f"{official.BOARD}; NL-LFR by inference and learning (2025), a model for each level",
-    ),
-    unit="mV",
-)
-
 
 def load(
     *,
@@ -164,7 +139,7 @@ def load(
         tests=[*levels_alone, record("arrow", "arrow", 0, skip=500)],
         noise_rms=noise_rms if path is None else None,
         seed=seed,
-        published=_PUBLISHED,
+        published=official.published("parwh"),
         notes=notes,
         linear=_linear(chosen, realisations),
         leaderboard=[] if path is None else [replace(test, skip=_WINDOW) for test in levels_alone],

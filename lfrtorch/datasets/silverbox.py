@@ -37,19 +37,6 @@ _TESTS = {  # first sample, and the one after the last
     "arrow_no_extrapolation": (100, 32_100),  # of the multisines' amplitudes
 }
 
-_PUBLISHED = official.published(
-    tuple(_TESTS),
-    ("PNLSS", (None, 0.26, None), official.LEGACY),
-    ("SUBNET", (0.36, 1.4, 0.32), official.BOARD),
-    ("GP-NARX", (0.345, 0.721, 0.286), official.BOARD),
-    (
-        "NL-LFR, inferred",
-        (0.289, 0.334, 0.257),
-        f"{official.BOARD}; NL-LFR by inference and learning (2025)",
-    ),
-    unit="mV",
-)
-
 
 def load(
     *,
@@ -99,6 +86,6 @@ def load(
         train=[part("train", begin + warm_up, trained, warm_up)],
         validation=[part("validation", trained, end, warm_up)],
         tests=[test(name, warm_up if name == "multisine" else 0) for name in _TESTS],
-        published=_PUBLISHED,
+        published=official.published("silverbox"),
         leaderboard=[replace(test(name, 0), start="estimated") for name in _TESTS],
     )

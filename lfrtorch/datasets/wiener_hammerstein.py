@@ -30,19 +30,6 @@ _WARM_UP = 1000  # samples, unscored, of the official test: a BLA's transient is
 _SITE = (5200, 105_200), (105_200, 184_000)  # estimation and test of nonlinearbenchmark.org
 
 
-_COMPARISON = "Beintema, Schoukens and Tóth (2023)"
-_PUBLISHED = official.published(
-    ("test", "site"),
-    ("BLA", (44,), "the best of several, which reach up to 56 mV"),
-    ("LSTM", (None, 1.54), official.BOARD),
-    ("PNLSS", (0.42, 0.42), official.LEGACY),
-    ("NL-LFR", (0.30, 0.30), f"Schoukens and Tóth (2020), and {official.BOARD}"),
-    ("QBLA", (0.279, 0.279), f"as compared in {_COMPARISON}, and {official.BOARD}"),
-    ("SUBNET", (0.241, 0.241), f"{_COMPARISON}, and {official.BOARD}"),
-    unit="mV",
-)
-
-
 def load(
     *,
     split: str = "official",
@@ -97,6 +84,6 @@ def load(
         train=[official.part(whole, first + skip, trained, warm_up=skip, name="train")],
         validation=[official.part(whole, trained, last, warm_up=_WARM_UP, name="validation")],
         tests=[of_site] if site else [of_paper, of_site],
-        published=_PUBLISHED,
+        published=official.published("wiener_hammerstein"),
         leaderboard=[of_site],
     )
