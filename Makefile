@@ -36,7 +36,7 @@ test-latest: $(READY)  ## fast tests with the newest ones (ARGS="--keep torch")
 coverage: $(READY)  ## lines and branches of lfrtorch/ that the fast tests reach
 	@$(BIN)/python -m pytest $(PARALLEL) --cov=lfrtorch --cov-branch --cov-report=term:skip-covered $(ARGS)
 
-mutants: $(READY)  ## faults put into the numerical core: does a test notice? (up to an hour)
+mutants: $(READY)  ## faults put into the package, room by room: does a test notice? (an hour or two)
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[mutants]'
 	@$(BIN)/python tests/mutants.py $(ARGS)
 
