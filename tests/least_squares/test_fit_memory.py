@@ -57,3 +57,18 @@ def test_a_system_of_all_start_states_is_checked_after_one_without(monkeypatch: 
     for eliminate in (True, True, False, False):
         problem.linearise(problem.theta, eliminate=eliminate)
     assert checked == [0, 100]
+
+
+@pytest.mark.parametrize(("states", "rows"), [(0, 0), (7, 0), (7, 100)])
+def test_bytes_are_those_of_the_matrices_of_a_step(states: int, rows: int, monkeypatch):
+    """Four of P x P, three of P x gauge directions, the largest group of these, and rows x P."""
+    asked: list[int] = []
+    monkeypatch.setattr(
+        "lfrtorch.least_squares.fit_memory.check_memory", lambda count, *_: asked.append(count)
+    )
+    cell = planned(3, 20)
+    cell.Bu.requires_grad_(False)
+    check_fit_memory(cell, states, rows)
+    P = sum(p.numel() for p in cell.parameters()) - 2 + states
+    numbers = 4 * P**2 + 3 * P * (2**2 + 3**2 + 1**2) + (3**2) ** 2 + rows * P
+    assert asked == [4 * numbers]

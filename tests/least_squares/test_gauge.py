@@ -2,13 +2,17 @@
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
+import scipy
 import torch
 from hypothesis import given, settings
 from reference import SIZES, normal, random_cell
 from torch.testing import assert_close
 
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.gauge_directions import free_directions, gauge_directions
+from lfrtorch.engine.held import held_parameters, structure
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.engine.simulation import simulate, steady_state
 from lfrtorch.least_squares import gauge
@@ -239,3 +243,45 @@ def test_reduction_of_before_does_not_bring_fixed_entries_back():
     fixed = entries(cell, "A")
     _, expand = reduction(cell, none(cell), before=before, fixed=fixed)
     assert not expand[:, fixed].any()
+
+
+# --- the directions themselves --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sizes", [(1, 1, 2, 1, 1, 3), (2, 1, 3, 2, 1, 4), (1, 2, 2, 1, 2, 3)])
+def test_no_output_changes_along_a_gauge_direction(sizes: tuple[int, ...]):
+    """Start states go along; there are as many as entries of the coordinates of x, z and w."""
+    cell = random_cell(*sizes, radius=0.5)
+    nu, _, nx, nz, nw, _ = sizes
+    u, x0 = normal(2, 15, nu), normal(2, nx, seed=1)
+    linearisation = Linearisation(cell, u, simulate(cell, u, x0), every=True)
+    G = torch.as_tensor(gauge_directions(cell.weights(), x0))
+    P = linearisation.parameters
+    assert G.shape == (P + 2 * nx, nx**2 + nz**2 + nw**2)
+    assert torch.linalg.matrix_rank(G) == G.shape[1]
+    by_all = output_jacobian(linearisation)
+    J = by_all.new_zeros(*by_all.shape[:3], P + 2 * nx)
+    J[..., :P] = by_all[..., :P]
+    J[0, ..., P : P + nx], J[1, ..., P + nx :] = by_all[0, ..., P:], by_all[1, ..., P:]
+    assert (J @ G).abs().max() < 1e-11 * J.abs().max() * G.abs().max()
+
+
+KINDS = ("free", "wiener", "hammerstein", "wiener_hammerstein", "parallel")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("nx", "branches", "nn"), [(4, 1, 5), (4, 2, 6), (5, 2, 4)])
+def test_free_directions_move_nothing_that_is_held(kind: str, nx: int, branches: int, nn: int):
+    cell = random_cell(1, 1, nx, branches, branches, nn, radius=0.5)
+    cell.hold(structure(cell, kind))
+    held = held_parameters(cell).numpy()
+    G = gauge_directions(cell.weights(), none(cell))
+    N = scipy.linalg.null_space(G[held]) if held.any() else np.eye(G.shape[1])
+    assert free_directions(cell) == N.shape[1]
+    with torch.no_grad():  # a start, where more directions move nothing
+        assert isinstance(cell.static, Network)
+        cell.static.zero_output()
+        cell.Bw.zero_()
+    assert free_directions(cell) == N.shape[1]
+    assert not cell.Bw.any()
+    assert not cell.static.Ww.any()
