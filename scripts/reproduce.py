@@ -37,7 +37,7 @@ from lfrtorch.cli.composition import composed
 from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.data.dataset import Dataset, Published
 from lfrtorch.datasets.official import LEGACY
-from lfrtorch.reporting import scores as report
+from lfrtorch.reporting.scores import ERRORS
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -257,11 +257,16 @@ def rows(each: Case) -> list[str]:
 
 def errors_of(run: dict[str, Any], dataset: Dataset) -> dict[str, tuple[dict[str, Any], Any]]:
     """The entry and the errors of each line of a run: a score, or one output of it."""
-    return {
-        line: (score, errors)
-        for name, score in run["scores"].items()
-        for line, errors in report.lines(name, score, dataset.published)
-    }
+    named = {key.rpartition(" ")[2] for p in dataset.published for key in p.scores if " " in key}
+    found = {}
+    for name, score in run["scores"].items():
+        found[name] = score, {of: score[of] for of in ERRORS}
+        for i, output in enumerate(score.get("outputs", [])):
+            if output in named:
+                errors = {of: score[f"{of}_by_output"] for of in ERRORS}
+                own = {of: each[i] if each else None for of, each in errors.items()}
+                found[f"{name} {output}"] = score, own
+    return found
 
 
 def costs(each: Case) -> str:

@@ -55,7 +55,7 @@ def evaluate(cfg: DictConfig) -> None:
     scored = replace(dataset, train=[])  # which is not scored, and need not be simulated
     evaluation = Evaluation(dataset=scored, linear=bla, model=model)
     scores = report.scored(evaluation, command)
-    print(f"\n{report.table(scores, dataset.published)}")
+    print(f"\n{report.table(evaluation)}")
     use = "test" if dataset.tests else "validation"
     parts = [
         part

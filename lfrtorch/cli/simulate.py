@@ -23,7 +23,7 @@ from lfrtorch.cli.composition import started
 from lfrtorch.files.load import listed_files
 from lfrtorch.files.stream import FileStream
 from lfrtorch.files.writer import FORMATS
-from lfrtorch.reporting.score_columns import of_samples
+from lfrtorch.reporting.evaluation import of_samples
 from lfrtorch.use.file_simulation import (
     Simulated,
     Start,
@@ -95,10 +95,7 @@ def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> S
 def scored(path: Path, model: lfrtorch.Model, result: Simulated) -> list[list[tables.Cell]]:
     """Rows of the table of scores, one an output."""
     scores = result.scores
-    counted = [
-        of_samples({"samples": result.samples, "skip": result.skip, "scored": count})
-        for count in scores.samples.tolist()
-    ]
+    counted = [of_samples(count, result.samples, result.skip) for count in scores.samples.tolist()]
     return [
         [path.name, c.name, c.unit, shown, scores.rmse[i], tables.in_percent(scores.nrmse[i])]
         for i, (c, shown) in enumerate(zip(model.outputs, counted, strict=True))

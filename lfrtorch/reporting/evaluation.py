@@ -56,6 +56,17 @@ class Score:
     """Errors summed over the samples of a horizon, by measure and by model."""
     ahead: int | None = None  # how far predictions are ahead whose errors these are
 
+    @property
+    def counted(self) -> str:
+        """The samples that count, in words."""
+        return of_samples(self.scored, self.samples, self.skip, self.records)
+
+    @property
+    def start_matters(self) -> bool:
+        """Whether the uncertainty of the start state makes a part of the error that is seen."""
+        added, error = self.start_error, self.rmse
+        return added is not None and error is not None and added > 0.2 * error  # 2 % of its power
+
     def entry(self) -> dict[str, Any]:
         """For ``metrics.json``: errors of each output and the number of records if several."""
         names = ("rmse", "lti_rmse", "nrmse")
@@ -74,6 +85,23 @@ class Score:
         for measure, by_model in self.sums.items():
             found |= {names[name] + measure: error for name, error in by_model.items()}
         return found | {"start_error": self.start_error}
+
+
+def finite(entry: Any) -> Any:
+    """The same nested entries with None for every number that JSON cannot hold."""
+    if isinstance(entry, dict):
+        return {key: finite(value) for key, value in entry.items()}
+    if isinstance(entry, list):
+        return [finite(value) for value in entry]
+    return None if isinstance(entry, float) and not math.isfinite(entry) else entry
+
+
+def of_samples(scored: int, samples: int, skip: int, records: int = 1) -> str:
+    """Which samples count, in words: the last ones of a record."""
+    if not scored:
+        return "not scored"
+    last = skip and scored == samples - skip and records == 1
+    return f"{'last ' * bool(last)}{scored} of {samples}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +255,10 @@ class Evaluation:
             found.setdefault((response.use, name), []).append(response.score)
         groups = self.dataset.groups
         return {key: _together(of) if key[1] in groups else of[-1] for key, of in found.items()}
+
+    def scores_of(self, *uses: str) -> dict[str, Score]:
+        """Scores of these uses by the name of a record or group."""
+        return {n: score for use in uses for (of, n), score in self.scores.items() if of == use}
 
     @property
     def _records(self) -> list[tuple[str, Record]]:

@@ -38,16 +38,13 @@ from lfrtorch.reporting.score_columns import (
     Row,
     columns,
     in_units,
-    joint_unit,
-    of_samples,
     rows_of,
-    start_matters,
     use_of,
 )
 from lfrtorch.reporting.scores import (
+    ESTIMATION,
     in_words,
     linear_name,
-    origins,
     own_linear,
     stability,
     starts,
@@ -77,12 +74,12 @@ def render(
         typed=command,
         config=config,
         date=datetime.now().strftime("%d %B %Y, %H:%M"),
-        sizes=in_words(run.metrics),
+        sizes=in_words(run.model.sizes, run.model.known_states, run.fit.averaged),
         numbers=", ".join(f"{name} {value}" for name, value in run.metrics["used"].items()),
         comparisons=comparisons(run.evaluation),
         linear_is_used=run.verdict.use == LINEAR_MODEL,
         used="RUN/linear" if run.verdict.use == LINEAR_MODEL else "RUN",
-        scores=_scores(run.metrics, run.evaluation),
+        scores=_scores(run.evaluation),
         data=_data(run.evaluation),
         records=[{"name": name, "views": list(own.items())} for name, own in (views or {}).items()],
         residuals_legend=RESIDUALS_LEGEND,
@@ -152,22 +149,22 @@ def _line(name: str, row: Row) -> str:
     )
 
 
-def _scores(metrics: Mapping[str, Any], evaluation: Evaluation) -> dict[str, Any]:
-    sizes = metrics["sizes"]["nz"], metrics["sizes"]["nw"]
+def _scores(evaluation: Evaluation) -> dict[str, Any]:
+    model = evaluation.refitted or evaluation.model
+    sizes = None if model is None else (model.sizes["nz"], model.sizes["nw"])
     published = [p for p in evaluation.dataset.published if p.sizes in (None, sizes)]
     found = evaluation.scores.items()
     rows = in_units([r for (_, name), s in found for r in rows_of(name, s)], published)
-    of_tests = [row for row in rows if row.score["use"] == "test"]
-    others = [row for row in rows if row.score["use"] != "test"]
-    linear = linear_name(metrics)
-    references = [own_linear(metrics)] if metrics["linear"] else []
+    of_tests = [row for row in rows if row.score.use == "test"]
+    others = [row for row in rows if row.score.use != "test"]
+    linear, references = linear_name(evaluation), own_linear(evaluation)
     references += [f"{p.label}: {p.reference}" for p in published if of_tests]
     references += [
-        f"{name}: the uncertainty of its start state adds {quantity(s['start_error'], unit)} to "
-        f"the NL-LFR's error of {quantity(s['rmse'], unit)}"
-        for name, s in (metrics["scores"] | metrics["validation"]["records"]).items()
-        if start_matters(s)
-        for unit in (joint_unit(s),)
+        f"{name}: the uncertainty of its start state adds {quantity(s.start_error, unit)} to "
+        f"the NL-LFR's error of {quantity(s.rmse, unit)}"
+        for name, s in evaluation.scores_of("test", *ESTIMATION).items()
+        if s.start_matters
+        for unit in (common_unit(s.channels),)
     ]
     return {
         "unit": "" if len(evaluation.dataset.train[0].outputs) > 1 else rows[0].unit,
@@ -194,7 +191,7 @@ def _data(evaluation: Evaluation) -> dict[str, Any]:
             factor, unit = engineering([moments[1]], channel.unit)
             channels.append([channel.name, side, unit, *(factor * moment for moment in moments)])
     records = [
-        [r.name, use_of(one.use, r.name), r.source, r.start, of_samples(one.score.entry()),
+        [r.name, use_of(one.use, r.name), r.source, r.start, one.score.counted,
          r.period]
         for one, r in ((response, response.record) for response in evaluation.simulations)
     ]  # fmt: skip
@@ -253,24 +250,24 @@ def _linear(run: Run) -> dict[str, Any]:
 
 
 def _fit(run: Run) -> dict[str, Any]:
-    fit, count = run.metrics["fit"], len(run.metrics["ranking"])
-    unit, head, rows, others = starts(run.metrics, common_unit(run.model.outputs))
+    fit, count = run.fit, len(run.fit.starts)
+    unit, head, rows, others = starts(fit, run.settings.seeds, common_unit(run.model.outputs))
     judge = "validation" if run.dataset.validation else "training"
     said = [
-        f"{fit['reason'].capitalize()}; kept iteration {run.metrics['chosen_iteration']} of "
-        f"{fit['iterations']}, the best on {judge}.",
+        f"{fit.outcome.capitalize()}; kept iteration {fit.chosen_iteration} of "
+        f"{fit.iterations}, the best on {judge}.",
         *[f"The best of {count} starts."] * (count > 1),
-        *origins(run.metrics),
+        *run.origins,
     ]
     return {"summary": " ".join(said), "unit": unit, "head": head, "starts": rows, "others": others}
 
 
 def _facts(run: Run) -> list[list[str]]:
-    fit, found = run.metrics["fit"], run.linear.fit
+    fit, found = run.fit, run.linear.fit
     weight = run.fit.model.lfr.cell.A
     facts = [
-        ["time of the fit", f"{number(fit['seconds'])} s"],
-        ["an iteration", f"{number(1e3 * fit['seconds_per_iteration'])} ms"],
+        ["time of the fit", f"{number(fit.seconds)} s"],
+        ["an iteration", f"{number(1e3 * fit.seconds_per_iteration)} ms"],
     ]
     if found is not None:
         facts.append(["time of the linear model", f"{number(found.seconds)} s"])

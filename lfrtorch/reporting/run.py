@@ -81,6 +81,13 @@ class Run:
         """Every record with both simulations."""
         return self.evaluation.simulations
 
+    @property
+    def origins(self) -> list[str]:
+        """What became of the best starts, if the model is not simply one of them."""
+        mean = f"The model is the mean of the best {self.fit.averaged} starts."
+        again = "Refitted to all estimation records: validation errors are those before it."
+        return [mean] * (self.fit.averaged > 1) + [again] * (self.refit is not None)
+
     def __repr__(self) -> str:
         sizes = ", ".join(f"{name}={size}" for name, size in self.model.sizes.items())
         return f"Run({self.dataset.name}, {sizes}, {self.fit.outcome})"
@@ -94,9 +101,9 @@ class Run:
         )
         if len(fit.starts) > 1:
             unit = common_unit(self.model.outputs)
-            parts.append(scores.starts_table(self.metrics, unit) + "\n")
-        parts += [f"{said}\n" for said in scores.origins(self.metrics)]
-        parts.append(scores.table(self.metrics, self.dataset.published))
+            parts.append(scores.starts_table(fit, self.settings.seeds, unit) + "\n")
+        parts += [f"{said}\n" for said in self.origins]
+        parts.append(scores.table(self.evaluation, fit.averaged))
         if self.parameters is not None:
             parts.append(f"\n{self.parameters}\n")
         if self.metrics["stable_to"] < max(LOUDER):

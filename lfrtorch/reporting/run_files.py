@@ -38,10 +38,10 @@ def write(
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    result, dataset = run.fit, run.dataset
+    result = run.fit
     run.model.save(folder / "model")
     run.linear.save(folder / "linear")
-    metrics = {**run.metrics, "command": command, **origin(dataset)}
+    metrics = {**run.metrics, "command": command, **origin(run.dataset)}
     board = TensorBoard(folder) if board is None else board
     if not board.begun:
         for earlier in folder.glob("events.out.tfevents.*"):
@@ -49,7 +49,7 @@ def write(
         board.history(result.history)
     texts = {
         "report": "\n\n".join(map(str, [run.verdict, *run.advice])),
-        "scores": scores.table(metrics, dataset.published),
+        "scores": scores.table(run.evaluation, result.averaged),
         "settings": config,
         "sizes": "" if run.choice is None else run.choice.table(),
     }

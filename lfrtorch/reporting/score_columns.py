@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from lfrtorch._support import tables
 from lfrtorch.data.dataset import Published
-from lfrtorch.reporting.evaluation import CROSS, Score
+from lfrtorch.data.records import common_unit, of_one_unit
+from lfrtorch.reporting.evaluation import CROSS, Score, finite
 
 ALL = "all"
 """Name of several outputs together."""
@@ -28,7 +29,7 @@ class Row(NamedTuple):
 
     key: str  # by which publications name it; the record's own in the first of its rows
     record: str
-    score: Mapping[str, Any]  # its entry in metrics.json
+    score: Score
     output: str
     unit: str
     linear: float | None
@@ -40,6 +41,10 @@ class Row(NamedTuple):
     def ratio(self) -> float:
         """The linear model's error over the NL-LFR's."""
         return self.linear / self.error if self.linear is not None and self.error else math.nan
+
+    def scaled(self, error: float | None) -> float | None:
+        """An error in the unit of the row."""
+        return tables.times(self.factor, error)
 
     def relative(self, error: float | None) -> float | None:
         """An error over the standard deviation of the output."""
@@ -56,35 +61,36 @@ class _Column(NamedTuple):
 
 def _error(row: Row) -> tables.Cell:
     """The NL-LFR's error, or that it diverges."""
-    known = row.error is None or not row.score["scored"] or math.isfinite(row.error)
-    return tables.times(row.factor, row.error) if known else "diverges"
+    known = row.error is None or not row.score.scored or math.isfinite(row.error)
+    return row.scaled(row.error) if known else "diverges"
 
 
 def _start(row: Row) -> tables.Cell:
     """What the uncertainty of the start adds, if that matters."""
-    return tables.times(row.factor, row.score["start_error"]) if start_matters(row.score) else None
+    return row.scaled(row.score.start_error) if row.score.start_matters else None
 
 
 def _published(of: Published, row: Row) -> tables.Cell:
     """What was published of a test."""
-    known = of.scores.get(row.key) if row.score["use"] == "test" else None
-    return tables.times(row.factor, known)
+    known = of.scores.get(row.key) if row.score.use == "test" else None
+    return row.scaled(known)
 
 
 _COLUMNS = (
     _Column("record", "terminal", lambda r: r.key),
     _Column("record", "tests others", lambda r: r.record if r.key == r.record else ""),
-    _Column("record", "linear", lambda r: r.record),
-    _Column("use", "terminal linear", lambda r: r.score["use"]),
-    _Column("use", "others", lambda r: use_of(r.score["use"], r.key) if r.key == r.record else ""),
-    _Column("source", "terminal linear", lambda r: r.score["source"].replace("file", "")),
-    _Column("scored", "terminal linear", lambda r: of_samples(r.score)),
-    _Column("output", "tests others", lambda r: r.output if "outputs" in r.score else ""),
-    _Column("output", "linear", lambda r: r.output),
-    _Column("unit", "tests others", lambda r: r.unit if "outputs" in r.score else ""),
-    _Column("unit", "linear", lambda r: r.unit),
-    _Column("{linear}", "terminal tests others linear", lambda r: tables.times(r.factor, r.linear)),
+    _Column("record", "linear outputs", lambda r: r.record),
+    _Column("use", "terminal linear", lambda r: r.score.use),
+    _Column("use", "others", lambda r: use_of(r.score.use, r.key) if r.key == r.record else ""),
+    _Column("source", "terminal linear", lambda r: r.score.source.replace("file", "")),
+    _Column("scored", "terminal linear", lambda r: r.score.counted),
+    _Column("output", "tests others", lambda r: r.output if len(r.score.channels) > 1 else ""),
+    _Column("output", "linear outputs", lambda r: r.output),
+    _Column("unit", "tests others", lambda r: r.unit if len(r.score.channels) > 1 else ""),
+    _Column("unit", "linear outputs", lambda r: r.unit),
+    _Column("{linear}", "terminal tests others linear outputs", lambda r: r.scaled(r.linear)),
     _Column("NL-LFR", "terminal tests others", _error),
+    _Column("NL-LFR", "outputs", lambda r: r.scaled(finite(r.error))),
     _Column("from the start", "terminal", _start),
     _Column("ratio", "tests others", lambda r: r.ratio),
     _Column("linear NRMSE", "tests others", lambda r: tables.percent(r.relative(r.linear))),
@@ -107,16 +113,35 @@ def columns(
 
 def rows_of(record: str, score: Score) -> list[Row]:
     """Errors of all outputs together, if they have one unit, and of each if there are several."""
-    entry, unknown = score.entry(), [None] * len(score.channels)
-    columns = score.lti_rmse_by_output or unknown, score.rmse_by_output or unknown
-    rows = [
-        Row(f"{record} {c.name}", record, entry, c.name, c.unit, linear, error, std)
-        for c, linear, error, std in zip(score.channels, *columns, score.std_by_output, strict=True)
+    together, *each = _every_row(record, score)
+    joint = [together] if len(each) > 1 and of_one_unit(score.channels) else []
+    first, *others = [*joint, *each]
+    return [first._replace(key=record), *others]
+
+
+def named_rows(record: str, score: Score, published: Sequence[Published]) -> list[Row]:
+    """Errors of all outputs together, and of those that published figures name."""
+    together, *each = _every_row(record, score)
+    named = {key.rpartition(" ")[2] for p in published for key in p.scores if " " in key}
+    own = [row._replace(unit=together.unit) for row in each if row.output in named]
+    rows = [together, *(own if len(each) > 1 else [])]
+    return [row._replace(linear=finite(row.linear)) for row in rows]
+
+
+def _every_row(record: str, score: Score) -> list[Row]:
+    """Errors of all outputs together, relative if they have several units, and of each."""
+    unknown = [None] * len(score.channels)
+    errors = score.lti_rmse_by_output or unknown, score.rmse_by_output or unknown
+    unit, joint = common_unit(score.channels), (score.lti_rmse, score.rmse, score.std)
+    return [
+        Row(record, record, score, ALL, unit, *joint),
+        *(
+            Row(f"{record} {c.name}", record, score, c.name, c.unit, linear, error, std)
+            for c, linear, error, std in zip(
+                score.channels, *errors, score.std_by_output, strict=True
+            )
+        ),
     ]
-    if len(rows) > 1 and len({row.unit for row in rows}) == 1:
-        unit = rows[0].unit
-        rows.insert(0, Row("", record, entry, ALL, unit, score.lti_rmse, score.rmse, score.std))
-    return [rows[0]._replace(key=record), *rows[1:]]
 
 
 def in_units(rows: Sequence[Row], published: Sequence[Published] = ()) -> list[Row]:
@@ -127,23 +152,3 @@ def in_units(rows: Sequence[Row], published: Sequence[Published] = ()) -> list[R
     asked = next((p.unit for p in published if p.unit), "")
     found = {unit: tables.engineering(own, unit, asked) for unit, own in values.items()}
     return [row._replace(factor=found[row.unit][0], unit=found[row.unit][1]) for row in rows]
-
-
-def of_samples(score: Mapping[str, Any]) -> str:
-    """Which samples count, in words: the last ones of a record."""
-    scored, samples, skip = (score[name] for name in ("scored", "samples", "skip"))
-    if not scored:
-        return "not scored"
-    last = skip and scored == samples - skip and score.get("records", 1) == 1
-    return f"{'last ' * bool(last)}{scored} of {samples}"
-
-
-def joint_unit(score: Mapping[str, Any]) -> str:
-    """The unit of the error of all outputs together; none of several units: it is relative."""
-    return "" if ", " in score["unit"] else score["unit"]
-
-
-def start_matters(score: Mapping[str, Any]) -> bool:
-    """Whether the uncertainty of the start state makes a part of the error that is seen."""
-    added, error = score["start_error"], score["rmse"]
-    return added is not None and error is not None and added > 0.2 * error  # 2 % of its power

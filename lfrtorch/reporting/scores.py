@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -14,18 +13,21 @@ from lfrtorch._support.reasons import Reason
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.analysis.physical_parameters import PhysicalParameters
 from lfrtorch.analysis.residual_analysis import Residuals
-from lfrtorch.data.dataset import LISTED, Published
+from lfrtorch.data.dataset import LISTED
 from lfrtorch.data.records import common_unit
 from lfrtorch.fitting.choice import Choice
 from lfrtorch.fitting.forgetting import Memory
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult
-from lfrtorch.reporting.evaluation import HORIZONS, Evaluation
-from lfrtorch.reporting.score_columns import Row, columns, in_units, joint_unit
+from lfrtorch.reporting.evaluation import HORIZONS, Evaluation, finite
+from lfrtorch.reporting.score_columns import ALL, columns, in_units, named_rows, rows_of
 from lfrtorch.reporting.verdict import Verdict
 
 ERRORS = "rmse", "lti_rmse"
 """Entries of a score in the unit of the outputs: of the NL-LFR and of the linear model."""
+
+ESTIMATION = "validation", "selection"
+"""Uses of records that choose, and are not fitted."""
 
 _MOST_ROWS = 24  # of outputs on the terminal; the report has all
 
@@ -88,10 +90,10 @@ def scored(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
     dataset, bla = evaluation.dataset, evaluation.linear
     model = evaluation.refitted or evaluation.model
     assert model is not None
-    entries = {
-        use: {name: s.entry() for (of, name), s in evaluation.scores.items() if of == use}
-        for use in ("validation", "selection", "test")
-    }
+    chosen_on, tests = (
+        {name: score.entry() for name, score in evaluation.scores_of(*uses).items()}
+        for uses in (ESTIMATION, ("test",))
+    )
     found = {
         "bench": dataset.name,
         "sizes": model.sizes,
@@ -102,9 +104,9 @@ def scored(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
         "data": {"noise_rms": dataset.noise_rms, "notes": list(dataset.notes)},
         "validation": {
             **{error: _pooled(evaluation, error) for error in ERRORS},
-            "records": entries["validation"] | entries["selection"],
+            "records": chosen_on,
         },
-        "scores": entries["test"],
+        "scores": tests,
         "predictions": _predicted(evaluation),
         "linear": {name: list(dataset.linear[name]) for name in evaluation.own},
         "command": command,
@@ -138,11 +140,50 @@ def _predicted(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
     return found
 
 
-def prediction_table(result: Mapping[str, Any]) -> str:
+def table(
+    evaluation: Evaluation,
+    averaged: int = 1,  # models that ours is the mean of
+) -> str:
+    """Our linear model and NL-LFR beside the published ones, in one unit; tests come first."""
+    model, published = evaluation.refitted or evaluation.model, evaluation.dataset.published
+    assert model is not None
+    others = [p for p in published if p.sizes in (None, (model.sizes["nz"], model.sizes["nw"]))]
+    tests, chosen_on = evaluation.scores_of("test"), evaluation.scores_of(*ESTIMATION)
+    listed = [*tests.items(), *chosen_on.items()]
+    rows = [row for name, score in listed for row in named_rows(name, score, others)]
+    linear, shown = linear_name(evaluation), in_words(model.sizes, model.known_states, averaged)
+    if not model.sizes["nz"] and not model.known_states:
+        linear, shown = "linear", f"nx {model.sizes['nx']}, a linear model"
+        rows = [row._replace(linear=row.error, error=None) for row in rows]
+    rows = in_units(rows, others)
+    units = {row.unit for row in rows}
+    ahead = next((s.ahead for _, s in listed if s.ahead is not None), None)
+    title = "Simulation RMSE" if ahead is None else f"RMSE of predictions {ahead} samples ahead"
+    title += _in_brackets(units.pop() if len(units) == 1 else "")
+    if not rows:
+        return f"{title}, {shown}: nothing is scored, as there is no test and no validation record"
+    head, cells, _ = columns("terminal", rows, linear=linear, published=others)
+    references = [
+        "from the start: what the uncertainty of the estimated start state adds to the NL-LFR's "
+        "error"
+    ] * ("from the start" in head)
+    references += own_linear(evaluation)
+    references += [f"{p.label}: {p.reference}" for p in others if p.label in head]
+    parts = [f"{title}, {shown}", tables.table(head, cells)]
+    parts += ["\n".join(references)] * bool(references)
+    several = [row for name, s in (tests or chosen_on).items() for row in rows_of(name, s)]
+    several = [r for r in several if len(r.score.channels) > 1 and r.output != ALL]
+    if 0 < len(several) <= _MOST_ROWS:  # a row a record is what the table above has
+        head, cells, _ = columns("outputs", several, linear=linear_name(evaluation))
+        parts += ["RMSE of each output", tables.table(head, cells)]
+    return "\n\n".join([*parts, *_prediction_table(evaluation), *_sums_table(evaluation)])
+
+
+def _prediction_table(evaluation: Evaluation) -> list[str]:
     """Errors of predictions, a line a record and model; nothing without them."""
-    listed = result["predictions"]
+    listed = _predicted(evaluation)
     if not listed:
-        return ""
+        return []
     units = {of["unit"] for of in listed.values()}
     errors = [e for of in listed.values() for part in ERRORS for e in of[part].values()]
     factor, unit = tables.engineering(errors, units.pop() if len(units) == 1 else "")
@@ -153,118 +194,59 @@ def prediction_table(result: Mapping[str, Any]) -> str:
         if of[part]
     ]
     ahead = [f"{h} sample{'s' if h > 1 else ''} ahead" for h in HORIZONS]
-    title = f"Prediction RMSE{f' ({unit})' if unit else ''}"
-    return f"\n\n{title}\n\n{tables.table(['record', 'use', 'model', *ahead], rows)}"
+    head = ["record", "use", "model", *ahead]
+    return [f"Prediction RMSE{_in_brackets(unit)}", tables.table(head, rows)]
 
 
-def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
-    """Our linear model and NL-LFR beside the published ones, in one unit; tests come first."""
-    sizes, shown = result["sizes"], f"nx {result['sizes']['nx']}, a linear model"
-    others = [p for p in published if p.sizes in (None, (sizes["nz"], sizes["nw"]))]
-    rows = [
-        Row(line, name, s, "", joint_unit(s), of["lti_rmse"], math.nan if e is None else e)
-        for part in (result["scores"], result["validation"]["records"])
-        for name, s in part.items()
-        for line, of in lines(name, s, others)
-        for e in (of["rmse"],)
-    ]
-    linear = linear_name(result)
-    if sizes["nz"] or result["known_states"]:
-        shown = in_words(result)
-    else:
-        linear, rows = "linear", [row._replace(linear=row.error, error=None) for row in rows]
-    rows = in_units(rows, others)
-    head, cells, _ = columns("terminal", rows, linear=linear, published=others)
-    units = {row.unit for row in rows}
-    listed = [*result["scores"].values(), *result["validation"]["records"].values()]
-    ahead = next((s["ahead"] for s in listed if "ahead" in s), None)
-    title = "Simulation RMSE" if ahead is None else f"RMSE of predictions {ahead} samples ahead"
-    title += f" ({unit})" if len(units) == 1 and (unit := units.pop()) else ""
-    if not rows:
-        return f"{title}, {shown}: nothing is scored, as there is no test and no validation record"
-    references = [
-        "from the start: what the uncertainty of the estimated start state adds to the NL-LFR's "
-        "error"
-    ] * ("from the start" in head)
-    references += [own_linear(result)] if result["linear"] else []
-    references += [f"{p.label}: {p.reference}" for p in others if p.label in head]
-    table = tables.table(head, cells)
-    simulated = [f"{title}, {shown}", "", table, *[""] * bool(references), *references]
-    more = [outputs_table(result), prediction_table(result), sums_table(result, published)]
-    return "\n".join(simulated) + "".join(more)
-
-
-def outputs_table(result: Mapping[str, Any]) -> str:
-    """Errors of each output if there are several, of the tests or else of validation."""
-    scored = result["scores"] or result["validation"]["records"]
-    rows: list[list[tables.Cell]] = []
-    for name, s in scored.items():
-        outputs = s.get("outputs", [])
-        units = s["unit"].split(", ")
-        units = units if len(units) == len(outputs) else units[:1] * len(outputs)
-        unknown = [None] * len(outputs)
-        errors = (s.get(f"{of}_by_output") or unknown for of in ("lti_rmse", "rmse"))
-        for output, unit, linear, error in zip(outputs, units, *errors, strict=True):
-            rows.append([name, output, unit, linear, error])
-    if not len(scored) < len(rows) <= _MOST_ROWS:  # a row a record is what the table above has
-        return ""
-    head = ["record", "output", "unit", linear_name(result), "NL-LFR"]
-    kept = [i for i in range(len(head)) if any(row[i] not in (None, "") for row in rows)]
-    listed = tables.table([head[i] for i in kept], [[row[i] for i in kept] for row in rows])
-    return f"\n\nRMSE of each output\n\n{listed}"
-
-
-def sums_table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
+def _sums_table(evaluation: Evaluation) -> list[str]:
     """Errors summed over the samples of a horizon, a line a record and measure; or nothing."""
-    rows: list[list[tables.Cell]] = []
-    for part in (result["scores"], result["validation"]["records"]):
-        for name, s in part.items():
-            for measure in (key.removeprefix("hold_") for key in s if key.startswith("hold_")):
-                errors = [s.get(f"{which}{measure}") for which in ("hold_", "lti_", "")]
-                others = [p.scores.get(f"{name} {measure}") for p in published]
-                rows.append([name, s["use"], measure, *errors, *others])
+    published = evaluation.dataset.published
+    names = "hold", "linear", "NL-LFR"
+    rows: list[list[tables.Cell]] = [
+        [
+            name,
+            score.use,
+            measure,
+            *(finite(by_model.get(model)) for model in names),
+            *(p.scores.get(f"{name} {measure}") for p in published),
+        ]
+        for name, score in evaluation.scores_of("test", *ESTIMATION).items()
+        for measure, by_model in score.sums.items()
+    ]
     if not rows:
-        return ""
-    head = ["record", "use", "sum of", "hold", "linear", "NL-LFR", *(p.label for p in published)]
+        return []
+    head = ["record", "use", "sum of", *names, *(p.label for p in published)]
     kept = [i for i in range(len(head)) if any(row[i] is not None for row in rows)]
-    rows = [[row[i] for i in kept] for row in rows]
-    listed = tables.table([head[i] for i in kept], rows)
-    return f"\n\nErrors from each sample on, summed over the horizon\n\n{listed}"
+    shown = tables.table([head[i] for i in kept], [[row[i] for i in kept] for row in rows])
+    return ["Errors from each sample on, summed over the horizon", shown]
 
 
-def lines(
-    name: str, entry: Mapping[str, Any], published: Sequence[Published]
-) -> list[tuple[str, Mapping[str, float | None]]]:
-    """Errors of a score by name: all outputs together, and those that published figures name."""
-    found: list[tuple[str, Mapping[str, float | None]]] = [(name, {of: entry[of] for of in ERRORS})]
-    named = {key.rpartition(" ")[2] for p in published for key in p.scores if " " in key}
-    for i, output in enumerate(entry.get("outputs", [])):
-        if output in named:
-            each = {of: entry[f"{of}_by_output"] for of in ERRORS}
-            errors = {of: values[i] if values else None for of, values in each.items()}
-            found.append((f"{name} {output}", errors))
-    return found
+def _in_brackets(unit: str) -> str:
+    return f" ({unit})" if unit else ""
 
 
-def linear_name(result: Mapping[str, Any]) -> str:
+def linear_name(evaluation: Evaluation) -> str:
     """The linear model with its order, which may differ from run to run."""
-    nx = result["lti_nx"]
-    return "linear" if nx is None else f"linear (nx {nx})"
+    return "linear" if evaluation.linear is None else f"linear (nx {evaluation.linear.nx})"
 
 
-def own_linear(result: Mapping[str, Any]) -> str:
+def own_linear(evaluation: Evaluation) -> list[str]:
     """Which tests have a linear model of their own, and of which records."""
+    linear = {name: evaluation.dataset.linear[name] for name in evaluation.own}
     models = [
         f"{name} of {'+'.join(of) if len(of) <= LISTED else f'{len(of)} training records'}"
-        for name, of in result["linear"].items()
+        for name, of in linear.items()
     ]
-    return f"linear: a model for each of these: {', '.join(models)}"
+    return [f"linear: a model for each of these: {', '.join(models)}"] if models else []
 
 
-def static_map(sizes: Mapping[str, int], known_states: int = 0) -> str:
-    """The sizes in words."""
+def in_words(sizes: Mapping[str, int], known_states: int = 0, averaged: int = 1) -> str:
+    """The sizes of a model in words; of a mean those of each model."""
+    if averaged > 1:
+        each = {name: size // averaged for name, size in sizes.items()}
+        return f"mean of {averaged} models with {in_words(each, known_states // averaged)}"
     if known_states:
-        learned = f"; beside it {static_map(sizes)}" if sizes["nz"] else ""
+        learned = f"; beside it {in_words(sizes)}" if sizes["nz"] else ""
         return f"a known model of {known_states} state(s){learned}"
     if "degree" in sizes:
         kind = f"polynomial of degree {sizes['degree']}"
@@ -273,46 +255,28 @@ def static_map(sizes: Mapping[str, int], known_states: int = 0) -> str:
     return f"nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {kind}"
 
 
-def in_words(result: Mapping[str, Any]) -> str:
-    """The sizes of the model of what :func:`metrics` returns; of a mean those of each model."""
-    count = result.get("averaged", 1)
-    each = {name: size // count for name, size in result["sizes"].items()}
-    words = static_map(each, result["known_states"] // count)
-    return f"mean of {count} models with {words}" if count > 1 else words
-
-
-def starts_table(result: Mapping[str, Any], unit: str = "") -> str:
+def starts_table(result: FitResult, seeds: Sequence[int], unit: str = "") -> str:
     """The starts of a fit that went to the end, and how many others there were."""
-    unit, head, rows, others = starts(result, unit)
-    title = f"Starts, RMSE of the best iterate of each{f' ({unit})' if unit else ''}"
+    unit, head, rows, others = starts(result, seeds, unit)
+    title = f"Starts, RMSE of the best iterate of each{_in_brackets(unit)}"
     return "\n\n".join(part for part in (title, tables.table(head, rows), others) if part)
 
 
 def starts(
-    result: Mapping[str, Any], unit: str
+    result: FitResult, seeds: Sequence[int], unit: str
 ) -> tuple[str, list[str], list[list[tables.Cell]], str]:
     """Unit, head and rows of the starts that no others ended, the best first, and of the others."""
-    ended = [start for start in result["ranking"] if start["reason"] != Reason.OTHERS_BETTER]
-    names = ("train", "validation", "selection")
-    factor, unit = tables.engineering([s[name] for s in ended for name in names], unit)
+    ended = [start for start in result.starts if start.reason != Reason.OTHERS_BETTER]
+    errors = [(start.train, start.validation, start.selection) for start in ended]
+    factor, unit = tables.engineering([e for each in errors for e in each], unit)
     head = ["seed", "iterations", "training", "validation", "selection", ""]
-    rows = [
-        [s["seed"], s["iterations"], *(tables.times(factor, s[n]) for n in names), s["reason"]]
-        for s in ended
+    rows: list[list[tables.Cell]] = [
+        [seeds[s.number], s.iterations, *(factor * e for e in each), s.reason]
+        for s, each in zip(ended, errors, strict=True)
     ]
-    count = len(result["ranking"]) - len(ended)
+    count = len(result.starts) - len(ended)
     others = f"{count} {'others' if count > 1 else 'other'} ended earlier: see metrics.json."
     return unit, head, rows, others if count else ""
-
-
-def origins(result: Mapping[str, Any]) -> list[str]:
-    """What became of the best starts, if the model is not simply one of them."""
-    said = []
-    if result["averaged"] > 1:
-        said.append(f"The model is the mean of the best {result['averaged']} starts.")
-    if result["refit"] is not None:
-        said.append("Refitted to all estimation records: validation errors are those before it.")
-    return said
 
 
 def stability(stable_to: float) -> str:
@@ -330,12 +294,3 @@ def stability(stable_to: float) -> str:
         f"Stable on the training inputs {stable}, and no longer on the next louder ones tried "
         f"({tried} times): validate at the amplitudes you will use."
     )
-
-
-def finite(entry: Any) -> Any:
-    """The same nested entries with None for every number that JSON cannot hold."""
-    if isinstance(entry, dict):
-        return {key: finite(value) for key, value in entry.items()}
-    if isinstance(entry, list):
-        return [finite(value) for value in entry]
-    return None if isinstance(entry, float) and not math.isfinite(entry) else entry

@@ -125,7 +125,8 @@ def test_a_score_is_the_mean_over_outputs_realisations_and_periods(tmp_path):
         u_offset=np.zeros(3), y_offset=np.zeros(3),
         inputs=data.train[0].inputs, outputs=data.train[0].outputs,
     ).to_model()  # fmt: skip
-    found = scores.scored(Evaluation(dataset=data, model=model))
+    evaluation = Evaluation(dataset=data, model=model)
+    found = scores.scored(evaluation)
     assert list(found["scores"]) == list(expected)
     for name, offset in expected.items():
         score = found["scores"][name]
@@ -134,7 +135,7 @@ def test_a_score_is_the_mean_over_outputs_realisations_and_periods(tmp_path):
         assert (score["records"], score["scored"]) == (6, 6 * 20)
         assert score["lti_rmse"] is None
     assert found["validation"]["records"]["validation_100"]["rmse"] < 1e-9
-    text = scores.table(found, data.published)
+    text = scores.table(evaluation)
     assert "(µm)" in text
     assert "0.0866" in text
 

@@ -13,7 +13,7 @@ from lfrtorch import InputError
 from lfrtorch.cli.composition import composed
 from lfrtorch.datasets import nanodrone
 from lfrtorch.known_systems import nanodrone as equations
-from lfrtorch.reporting.scores import sums_table, table
+from lfrtorch.reporting.scores import table
 
 
 def write(folder: Path, name: str, samples: int = 80, seed: int = 0) -> None:
@@ -153,8 +153,9 @@ def test_a_run_has_the_sums_of_the_kind_that_is_left_out(flights: Path) -> None:
     assert score["hold_position"] == pytest.approx(sum(each.mean() for each in moved) / 2)
     assert all(score[name] > 0 for name in nanodrone.MEASURES)
     assert score["records"] == 2
-    assert "position" in sums_table(run.metrics, ())
-    assert table(run.metrics, ()).startswith("RMSE of predictions 10 samples ahead")
+    shown = table(run.evaluation)
+    assert "position" in shown.split("summed over the horizon")[1]
+    assert shown.startswith("RMSE of predictions 10 samples ahead")
 
 
 def test_the_benchmark_has_its_equations_and_horizon() -> None:

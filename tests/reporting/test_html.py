@@ -82,7 +82,7 @@ class Run:
         )
         found = lfrtorch.Run(
             dataset=self.dataset,
-            settings=lfrtorch.Settings(nx=2),
+            settings=lfrtorch.Settings(nx=2, starts=2),
             linear=self.bla,
             order_scan=None,
             choice=None,
@@ -281,11 +281,12 @@ def test_records_of_a_group_have_one_score():
     assert f"board all mV {linear} {error}" in page
     a, b = (number(1e3 * score["rmse_by_output"][i]) for i in range(2))
     assert re.search(rf"a mV \S+ {a} .* b mV \S+ {b} ", page)
-    table, by_output = report.table(metrics, data.published).split("RMSE of each output")
+    table, by_output = report.table(grouped.evaluation).split("RMSE of each output")
     assert by_output.count("board") == 2
     rows = {line.split("  ")[0]: line.split()[-1] for line in table.splitlines() if "  " in line}
     assert (rows["board"], rows["board b"], rows["validation b"]) == ("250", "125", "–")
-    untested = report.table(metrics | {"scores": {}}, data.published)
+    untested = Run(same.result, same.bla, replace(data, tests=[], groups={}))
+    untested = report.table(untested.evaluation)
     assert "validation b" in untested
     assert "other" not in untested  # nothing to compare with
 

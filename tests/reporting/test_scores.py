@@ -12,8 +12,8 @@ import lfrtorch
 from lfrtorch.data.dataset import Dataset, Published
 from lfrtorch.data.records import Channel, Record
 from lfrtorch.reporting import scores as report
-from lfrtorch.reporting.evaluation import Evaluation, Response
-from lfrtorch.reporting.score_columns import of_samples, use_of
+from lfrtorch.reporting.evaluation import Evaluation, Response, of_samples
+from lfrtorch.reporting.score_columns import use_of
 
 pytestmark = pytest.mark.numeric
 
@@ -73,26 +73,24 @@ def test_starts_are_ranked_in_files_and_in_a_table(result):
     assert sorted(start["seed"] for start in metrics["ranking"]) == SEEDS
     assert {start["selection"] for start in metrics["ranking"]} == {None}
     assert metrics["ranking"][0]["validation"] == fitted.starts[0].validation
-    lines = report.starts_table(metrics).splitlines()
+    lines = report.starts_table(fitted, SEEDS).splitlines()
     assert lines[2].split() == ["seed", "iterations", "training", "validation", "selection"]
     assert lines[4].split()[0] == str(metrics["ranking"][0]["seed"])
     assert len(lines) == 8  # two went to the end
     assert lines[-1] == "1 other ended earlier: see metrics.json."
-    ended = {**metrics, "ranking": metrics["ranking"][:2]}
-    assert "earlier" not in report.starts_table(ended)
+    assert "earlier" not in report.starts_table(replace(fitted, starts=fitted.starts[:2]), SEEDS)
 
 
 def test_a_test_may_have_a_linear_model_of_its_own(result):
     fitted, bla, data = result
     data = replace(data, linear={"test": ("train",)})
     own = lfrtorch.estimate_bla(data.train, nx=1)
-    metrics = report.metrics(
-        fitted, evaluated(fitted, bla, data, own={"test": own}), settings=lfrtorch.Settings(nx=2)
-    )
+    evaluation = evaluated(fitted, bla, data, own={"test": own})
+    metrics = report.metrics(fitted, evaluation, settings=lfrtorch.Settings(nx=2))
     expected = lfrtorch.rmse(data.tests[0], own.simulate(data.tests[0]))
     assert metrics["scores"]["test"]["lti_rmse"] == expected
     assert metrics["linear"] == {"test": ["train"]}
-    text = report.table(metrics, data.published)
+    text = report.table(evaluation)
     assert "linear: a model for each of these: test of train\n" in text
 
 
@@ -139,8 +137,9 @@ def test_pooled_validation_weighs_samples():
 
 def test_table_shows_published_results_of_these_sizes_only(result):
     fitted, bla, data = result
-    metrics = report.metrics(fitted, evaluated(fitted, bla, data), settings=lfrtorch.Settings(nx=2))
-    lines = report.table(metrics, data.published).splitlines()
+    evaluation = evaluated(fitted, bla, data)
+    metrics = report.metrics(fitted, evaluation, settings=lfrtorch.Settings(nx=2))
+    lines = report.table(evaluation).splitlines()
     assert lines[0] == "Simulation RMSE (mV), nx 2, nz 1, nw 1, 3 neurons"
     head, row = lines[2].split(), lines[4].split()
     columns = ["record", "use", "source", "scored", "linear", "(nx", "2)"]  # ours has its own nx
@@ -171,12 +170,11 @@ def test_outputs_of_several_units_have_a_relative_error_together(units: tuple[st
 
 
 def test_the_table_says_which_samples_are_scored():
-    counts = {"samples": 300, "skip": 5, "scored": 295}
-    assert of_samples(counts) == "last 295 of 300"
-    assert of_samples(counts | {"scored": 290}) == "290 of 300"  # some are not valid
-    assert of_samples(counts | {"records": 2}) == "295 of 300"
-    assert of_samples(counts | {"skip": 0, "scored": 300}) == "300 of 300"
-    assert of_samples(counts | {"skip": 300, "scored": 0}) == "not scored"
+    assert of_samples(295, 300, 5) == "last 295 of 300"
+    assert of_samples(290, 300, 5) == "290 of 300"  # some are not valid
+    assert of_samples(295, 300, 5, records=2) == "295 of 300"
+    assert of_samples(300, 300, 0) == "300 of 300"
+    assert of_samples(0, 300, 300) == "not scored"
 
 
 def test_what_is_not_finite_becomes_null():
@@ -190,14 +188,14 @@ def test_what_is_not_finite_becomes_null():
 
 def test_neurons_in_words():
     sizes = {"nx": 2, "nz": 1, "nw": 1, "nn": 0}
-    assert report.static_map(sizes) == "nx 2, nz 1, nw 1, a map of one's own"
+    assert report.in_words(sizes) == "nx 2, nz 1, nw 1, a map of one's own"
 
 
 def test_a_mean_is_called_so_with_the_sizes_of_each_model():
-    summed = {"sizes": {"nx": 6, "nz": 9, "nw": 9, "nn": 48}, "known_states": 0, "averaged": 3}
+    sizes = {"nx": 6, "nz": 9, "nw": 9, "nn": 48}
     each = "nx 2, nz 3, nw 3, 16 neurons"
-    assert report.in_words(summed) == f"mean of 3 models with {each}"
-    assert report.in_words({**summed, "averaged": 1}).startswith("nx 6")
+    assert report.in_words(sizes, averaged=3) == f"mean of 3 models with {each}"
+    assert report.in_words(sizes).startswith("nx 6")
 
 
 def test_what_was_left_out_in_turn_chose_nothing():
@@ -206,14 +204,23 @@ def test_what_was_left_out_in_turn_chose_nothing():
     assert use_of("validation", "run") == "chooses the iterate"
 
 
-def test_several_outputs_have_a_table_of_their_own():
-    score = {"unit": "m, V", "outputs": ["a", "b"], "rmse_by_output": [1.0, None]}
-    score |= {"lti_rmse_by_output": [2.0, 3.0]}
-    result = {"scores": {"test": score}, "validation": {"records": {}}, "lti_nx": 2}
-    shown = report.outputs_table(result)
-    assert "RMSE of each output" in shown
-    assert [line.split() for line in shown.splitlines()[-2:]] == [
-        ["test", "a", "m", "2.00", "1.00"], ["test", "b", "V", "3.00", "\N{EN DASH}"],
-    ]  # fmt: skip
-    one = {"unit": "m", "outputs": ["a"], "rmse_by_output": [1.0], "lti_rmse_by_output": [2.0]}
-    assert report.outputs_table({**result, "scores": {"test": one}}) == ""
+@pytest.mark.parametrize("units", [("m", "V"), ("V", "V")])
+def test_several_outputs_have_a_table_of_their_own(result, units: tuple[str, str]):
+    fitted, _, _ = result
+    y = np.random.default_rng(0).standard_normal((100, 3))
+    channels = tuple(Channel(*of) for of in zip("abc", (*units, "V"), strict=True))
+    record = Record(y, y, outputs=channels, name="test")
+    models = {"linear": np.add(y, [2.0, 3.0, 4.0]), "NL-LFR": np.add(y, [1.0, np.nan, 5.0])}
+    evaluation = Evaluation(dataset=Dataset("three", [], [], [record]), model=fitted.model)
+    vars(evaluation)["simulations"] = [Response(record, "test", models)]
+    _, shown = report.table(evaluation).split("RMSE of each output")
+    assert [line.split() for line in shown.splitlines()[-3:]] == [
+        ["test", "a", units[0], "2.00", "1.00"],
+        ["test", "b", units[1], "3.00", "\N{EN DASH}"],
+        ["test", "c", "V", "4.00", "5.00"],
+    ]
+    one = replace(record, y=y[:, :1], outputs=channels[:1])
+    models = {name: y_hat[:, :1] for name, y_hat in models.items()}
+    alone = Evaluation(dataset=Dataset("one", [], [], [one]), model=fitted.model)
+    vars(alone)["simulations"] = [Response(one, "test", models)]
+    assert "RMSE of each output" not in report.table(alone)
