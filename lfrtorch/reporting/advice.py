@@ -1,4 +1,4 @@
-"""What to try next after a fit, from numbers alone. Each rule names the numbers that it rests on.
+"""What to try next after a fit, from numbers alone: a table of rules, a row each.
 
 The numbers, and the thresholds that several rules share, are those of
 :mod:`lfrtorch.reporting.diagnosis`.
@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from lfrtorch._support.tables import number, percent
@@ -22,7 +21,6 @@ from lfrtorch.reporting.diagnosis import (
     OVERFIT,
     SOUND,
     UNEXPLAINED,
-    USELESS,
     Evidence,
 )
 
@@ -46,7 +44,7 @@ class Advice(NamedTuple):
             >>> Advice("", "", {"ridge": "auto"}).command("lfrtorch fit x.csv fs=10 ridge=1e-3")
             'lfrtorch fit x.csv fs=10 ridge=auto'
         """
-        words = shlex.split(self.words) or _typed(self.change or {})
+        words = shlex.split(self.words) or _words(self.change or {})
         # A run has its words spelt out: data.validation=0.2.
         named = tuple(f"{word.partition('=')[0]}=" for word in words)
         kept = [w for w in shlex.split(before) if not w.removeprefix("data.").startswith(named)]
@@ -56,22 +54,43 @@ class Advice(NamedTuple):
         return f"{self.text} ({self.evidence})"
 
 
-class Row(NamedTuple):
-    """A rule as a row of a table: it speaks where a number is beyond its limit."""
+class _Number(float):
+    """A number in a sentence: {name:%} in per cent, {name} in three digits."""
 
-    number: Callable[[Evidence], float | None]
-    limit: float
-    sentence: Callable[[Evidence], str]
-    because: Callable[[Evidence], str]
-    change: Callable[[Evidence], Mapping[str, Any] | None] = lambda _: None
+    def __format__(self, how: str) -> str:
+        return percent(float(self)) if how == "%" else number(float(self))
+
+
+class _Numbers(dict[str, Any]):
+    """What a sentence may name: a number of the evidence ``e``, and the change."""
+
+    def __missing__(self, name: str) -> Any:
+        value = getattr(self["e"], name)
+        unknown = math.nan if value is None else value
+        return _Number(unknown) if isinstance(unknown, float) else value
+
+
+class Rule(NamedTuple):
+    """A row of the table: when it speaks, what it says and why, and what to change."""
+
+    when: Callable[[Evidence], bool]
+    text: str | Callable[[Evidence], str]  # a string has numbers by name
+    because: str | Callable[[Evidence], str]  # likewise; empty if there is nothing to say
+    change: Callable[[Evidence], Mapping[str, Any]] = lambda _: {}
     words: str = ""
+    instead: str = ""  # of the change in the sentence, if there is none
 
     def __call__(self, e: Evidence) -> Advice | None:
         """What it advises, if anything."""
-        number = self.number(e)
-        if number is None or number <= self.limit:
+        if not self.when(e):
             return None
-        return Advice(self.sentence(e), self.because(e), self.change(e), self.words)
+        change = self.change(e)
+        numbers = _Numbers(e=e, change=_written(change) or self.instead)
+        text, because = (
+            said.format_map(numbers) if isinstance(said, str) else said(e)
+            for said in (self.text, self.because)
+        )
+        return Advice(text, because, change or None, self.words) if because else None
 
 
 def advise(evidence: Evidence) -> list[Advice]:
@@ -79,366 +98,101 @@ def advise(evidence: Evidence) -> list[Advice]:
     # At the noise, and where the inputs explain little, there is no advice on sizes and search.
     e = evidence
     without = e.noise_limited or e.nothing_left or e.unexplained
-    rules = [rule for rule, on_the_model in _RULES if not (on_the_model and without)]
+    rules = [*_OF_DATA.values(), *([] if without else _OF_MODEL.values()), *_OF_USE.values()]
     found = [advice for rule in rules if (advice := rule(e)) is not None]
     # More is not to be measured while there is something else to do.
-    return found or [advice for advice in [noise_unknown(e)] if advice is not None]
+    return found or [advice for advice in [RULES["noise_unknown"](e)] if advice is not None]
 
 
-def diverges(e: Evidence) -> Advice | None:
-    """A record on which the simulation runs away."""
-    if not e.diverged:
-        return None
-    change = {} if e.ridge or e.given else {"ridge": "auto"}
-    ridge = _written(change) if change else "a larger ridge" if e.ridge else "ridge=1e-3"
-    loud = any(e.louder.get(name, 0.0) > EXTRAPOLATES for name in e.diverged)
-    return Advice(
-        "The model is not usable yet: "
-        + (f"train on inputs as loud as the tests', or use {ridge}." if loud else f"use {ridge}."),
-        f"the NL-LFR diverges on {_listed([repr(name) for name in e.diverged])}",
-        change or None,
-    )
+def _above(value: float | None, limit: float) -> bool:
+    return value is not None and value > limit
 
 
-def starts_in_a_transient(e: Evidence) -> Advice | None:
-    """An error at the beginning of the records that another start state removes."""
-    if e.transient is None or e.transient <= _TRANSIENT or e.free is None or e.free <= 0.5:
-        return None
-    return Advice(
-        "The records do not begin at the model's rest: skip more samples (skip=N), or estimate "
-        "their starts (start='estimated').",
-        f"in their first twentieth the training error is {number(e.transient)} times that of "
-        f"the rest, and a free response explains {percent(e.free)} of its power",
-        words="start=estimated",
-    )
+def _of_ridge(e: Evidence) -> dict[str, Any]:
+    """A ridge to be chosen, if it can be and there is none."""
+    return {} if e.ridge or e.given else {"ridge": "auto"}
 
 
-def nothing_held_out(e: Evidence) -> Advice | None:
-    """No validation record: overfitting cannot be seen, nor sizes be chosen."""
-    if e.validation is not None or e.linear_validation is not None or e.train is None:
-        return None
-    return Advice(
-        ("Hold" if e.lost_on_tests else "Overfitting would not show: hold")
-        + " out a part (validation=0.2) to choose iterations and sizes, then fit all with them.",
-        f"{e.parameters} parameters are fitted to {e.samples} samples",
-        words="validation=0.2",
-    )
-
-
-def validation_is_unlike(e: Evidence) -> Advice | None:
-    """A validation part on which the linear model does much better or worse than in training."""
-    if not e.parts_differ:
-        return None
-    return Advice(
-        "The validation part is unlike the training part: hold out a longer one "
-        "(validation=0.4), or records by name (validation=[NAME]).",
-        f"error of the linear model: validation {percent(e.linear_validation)}, "
-        f"training {percent(e.linear_train)}",
-        words="validation=0.4",
-    )
-
-
-def neither_usable(e: Evidence) -> Advice | None:
-    """Inputs that do not explain the outputs, whatever the model, or only those in training."""
-    if not e.neither or e.diverged or e.train is None or not e.linear_train:
-        return None
-    evidence = f"training error {percent(e.train)}, of the linear model {percent(e.linear_train)}"
-    if e.unexplained:
-        return Advice(
-            "The inputs explain little of the outputs: look at the columns, delays and units, and "
-            "for other inputs (lfrtorch preview).",
-            evidence,
-        )
-    if e.parts_differ or e.train > UNEXPLAINED:  # said there, or not even that
-        return None
-    return Advice(
-        "The models hold in training alone: the other parts are unlike, too short or at rest, or "
-        "begin in another state (start='estimated').",
-        evidence,
-    )
-
-
-def gain_is_lost(e: Evidence) -> Advice | None:
-    """A gain over the linear model that the tests have not."""
-    if not e.lost_on_tests or e.parts_differ or e.neither:
-        return None
-    which = e.judged[2]
-    return Advice(
-        f"The gain on {which} is lost on the tests: they are unlike, or the model is overfit; "
-        "hold out a longer part (validation=0.4), or measure longer.",
-        f"error over the linear model's: {which} {percent(e.gain)}, tests {percent(e.tests)}",
-        words="validation=0.4",
-    )
-
-
-def at_the_noise(e: Evidence) -> Advice | None:
-    """Nothing to gain from a larger model."""
-    if not e.noise_limited:
-        return None
-    return Advice(
-        "Noise-limited: nothing to gain from more neurons, states or starts; more data or less "
-        "noise make the model better.",
-        f"training error {percent(e.train)}, noise {percent(e.noise)} of the output's "
-        "standard deviation",
-    )
-
-
-nothing_moves = Row(
-    lambda e: float(e.settled),
-    0.0,
-    lambda e: (
-        "Nothing held out moves: test with another record (test=FILE.csv), or put the part "
-        "that moves last."
-    ),
-    lambda e: "inputs and outputs of all parts that were held out have settled",
-    words="test=FILE.csv",
-)
-
-nothing_left = Row(
-    lambda e: float(e.nothing_left),
-    0.0,
-    lambda e: (
-        "Nothing is left to find: the errors are white, and as large as the noise seems to be."
-    ),
-    lambda e: (
-        f"training error {percent(e.train)}, noise by the quietest part of the spectrum "
-        f"{percent(e.guess)} of the output's standard deviation"
-    ),
-)
-
-ended_by_limit = Row(
-    lambda e: float(e.spent and e.falling <= FALLING and (e.overfit or 0.0) <= _CLOSE),
-    0.0,
-    lambda e: (
-        f"The limit of {e.iterations} iterations ended every start: "
-        + ("init_from=RUN goes on from here, " if e.searched else "")
-        + f"trainer.max_iter={4 * e.iterations}."
-    ),
-    lambda e: (
-        f"kept iteration {e.iterations} of {e.iterations}"
-        + ("; where sizes are chosen the limit is what their ridge was chosen with" * e.searched)
-    ),
-    lambda e: None if e.searched else {"trainer": replace(e.trainer, max_iter=4 * e.iterations)},
-)
-
-
-def still_falling(e: Evidence) -> Advice | None:
-    """The iterations ended before the search did, and the error that falls is on validation."""
-    if e.falling <= FALLING or e.validation is None:
-        return None
-    limit = 4 * max(e.iterations, 1)
-    return Advice(
-        f"Still falling: trainer.max_iter={limit}; init_from=RUN goes on from here.",
-        f"at the pace of the last iterations the validation error falls by {percent(e.falling)} "
-        f"in a tenth of the {e.iterations}",
-        {"trainer": replace(e.trainer, max_iter=limit)},
-    )
-
-
-def overfits(e: Evidence) -> Advice | None:
-    """Validation much above training, or rising while training goes on."""
-    if e.parts_differ:
-        return None
+def _overfit(e: Evidence) -> str:
+    """How the error grows beyond training, or while training goes on; empty if it does not."""
     part, growth = max(e.growths.items(), key=lambda item: item[1], default=("", 0.0))
-    if growth > OVERFIT:
-        if part == "test" and e.lost_on_tests:
-            return None  # said there
-        evidence = (
-            f"{part} error {percent(e.test if part == 'test' else e.validation)}, training error "
-            f"{percent(e.train)}: {number(growth)} times the growth of the linear model's"
-        )
-    elif e.overtrained:
-        evidence = (
+    if growth <= OVERFIT:
+        return (
             f"after the kept iterate validation is at {number(e.risen)} times its error, and "
             f"training fell to {percent(e.fell)}; {number(e.samples / max(1, e.parameters))} "
             "samples a parameter"
-        )
-    else:
-        return None
-    change = {} if e.searched or e.ridge or e.given else {"ridge": "auto"}
-    ridge = f"{_written(change)}, or " if change else "a larger ridge, or " if e.known else ""
-    return Advice(f"Overfit: {ridge}more data.", evidence, change or None)
+        ) * e.overtrained
+    return (
+        f"{part} error {percent(e.test if part == 'test' else e.validation)}, training error "
+        f"{percent(e.train)}: {number(growth)} times the growth of the linear model's"
+    ) * (part != "test" or not e.lost_on_tests)  # said there
 
 
-def linear_part_incomplete(e: Evidence) -> Advice | None:
-    """An error that is linear in the inputs: states are missing."""
-    if not e.states_missing:
-        return None
-    nx = e.sizes.get("nx", 0)
-    order = f"nx={nx + 1}, nx={nx + 2} or nx='auto'" if nx else "a higher nx"
-    if e.known:
-        order = f"nx={nx + 1} or nx={nx + 2} states beside the known ones"
-    return Advice(
-        f"The linear part is incomplete: {order}.",
-        f"a linear filter of the inputs explains {percent(e.linear)} of the error's power",
-        {"nx": nx + 1} if nx or e.known else None,
-    )
-
-
-def hardly_better(e: Evidence) -> Advice | None:
+def _gains_little(e: Evidence) -> bool:
     """No gain over the linear model, of which no states are missing."""
-    if not e.useless or e.parts_differ or e.neither or e.states_missing or e.overtrained:
-        return None
-    error, linear_error, which = e.judged
-    gain = f"{which} error {percent(error)}, of the linear model {percent(linear_error)}"
-    if e.linear_train and e.noise and e.linear_train <= NOISE_LIMITED * e.noise:
-        if e.better or e.linear_train < SOUND * e.noise:
-            return None
-        return Advice("The system is linear at this level: the linear model is enough.", gain)
-    if e.searched:
-        if e.better:
-            return None
-        return Advice(
-            "Hardly better than the linear model at any size searched: the system is linear at "
-            "this level, or the rest is no static map of a few signals.",
-            gain,
-        )
-    states = {"nx": e.sizes["nx"] + 1} if e.linear is None and e.sizes.get("nx") else {}
-    change: dict[str, Any] = _larger(e, states)
-    if not e.continued and e.started < 8:
-        change = {"starts": 8, **change}
-    more = _written(change) or "more data"
-    return Advice(
-        f"The gain on {which} is small; a longer search or larger sizes may have more: {more}."
-        if e.better
-        else "Hardly better than the linear model: the system is linear at this level, or the "
-        f"search or the sizes are too small: {more}.",
-        gain,
-        change or None,
-    )
+    return e.useless and not (e.parts_differ or e.neither or e.states_missing or e.overtrained)
 
 
-def outputs_left_out(e: Evidence) -> Advice | None:
-    """Outputs without gain, while others have one: the static map has too few outputs."""
-    behind = {name: ratio for name, ratio in e.outputs.items() if ratio > USELESS}
-    change = {name: e.sizes.get(name, 0) + 1 for name in ("nw", "nz")}
-    if not behind or e.gain is None or e.useless or e.lost_on_tests or not _borne(e, change):
-        return None
-    ratios = _listed([f"{number(ratio)} times on '{name}'" for name, ratio in behind.items()])
-    return Advice(
-        f"Some outputs gain nothing, or are linear: {_written(change)}.",
-        f"{e.judged[2]} error {ratios} that of the linear model, and less on the others",
-        change,
-    )
+def _is_small(e: Evidence) -> bool:
+    """Likewise, of given sizes and above the noise."""
+    return _gains_little(e) and e.linear_over_noise > NOISE_LIMITED and not e.searched
 
 
-def nonlinear_part_incomplete(e: Evidence) -> Advice | None:
-    """An error that is neither noise nor linear: the static map is too small."""
-    if e.gain is None or e.useless or e.lost_on_tests or e.states_missing or e.overtrained:
-        return None
-    if e.noise and e.train is not None:
-        # From there on the model's own share is above the noise.
-        if e.train <= 1.5 * e.noise:
-            return None
-        evidence = f"training error {number(e.train / e.noise)} times the noise"
-        if e.linear is not None:
-            evidence += f", and only {percent(e.linear)} of its power linear in the inputs"
-    elif e.nonlinear is not None and e.nonlinear > NONLINEAR:
+def _more(e: Evidence) -> dict[str, Any]:
+    """More starts, and larger sizes."""
+    states = {"nx": e.nx + 1} if e.linear is None and e.nx else {}
+    return {**({} if e.continued or e.started >= 8 else {"starts": 8}), **_larger(e, states)}
+
+
+def _more_outputs(e: Evidence) -> dict[str, int]:
+    return {name: e.sizes.get(name, 0) + 1 for name in ("nw", "nz")}
+
+
+def _is_spent(e: Evidence) -> bool:
+    return e.spent and e.falling <= FALLING and (e.overfit or 0.0) <= _CLOSE
+
+
+def _longer(e: Evidence) -> dict[str, Any]:
+    return {"trainer": replace(e.trainer, max_iter=4 * max(e.iterations, 1))}
+
+
+def _map_is_small(e: Evidence) -> bool:
+    """Whether an error that is not noise says so."""
+    other = e.useless or e.lost_on_tests or e.states_missing or e.overtrained
+    return e.gain is not None and not other
+
+
+def _not_noise(e: Evidence) -> str:
+    """What shows that the error is not noise; empty if nothing does."""
+    if not e.noise or e.train is None:
         part = percent(e.nonlinear)
-        evidence = f"squares and cubes of the outputs explain {part} of the error's power"
-    else:
-        return None
-    change = _larger(e)
-    larger = _written(change) or "more data would bear a larger map"
-    text = "at any size searched; more data may bear a larger map" if e.searched else larger
-    return Advice(
-        f"Nonlinear behaviour is left: {text}.", evidence, None if e.searched else change or None
-    )
+        said = f"squares and cubes of the outputs explain {part} of the error's power"
+        return said * _above(e.nonlinear, NONLINEAR)
+    said = f"training error {number(e.train / e.noise)} times the noise"
+    if e.linear is not None:
+        said += f", and only {percent(e.linear)} of its power linear in the inputs"
+    return said * (e.train > 1.5 * e.noise)  # from there on the model's own share is above it
 
 
-def best_start_alone(e: Evidence) -> Advice | None:
-    """Starts that end far apart: a better minimum may not have been met."""
-    found = sorted(e.starts)
-    # Beyond that ratio the best may be luck.
-    if len(found) < 2 or found[0] <= 0 or found[1] <= 1.2 * found[0] or e.parts_differ:
-        return None
-    starts = 2 * max(e.started, 4)
-    return Advice(
-        f"The minimum may be a poor one: starts={starts}.",
-        f"the second best start's error is {number(found[1] / found[0])} times that of the best, "
-        f"of {e.started}",
-        {"starts": starts},
-    )
+def _far(e: Evidence) -> dict[str, float]:
+    """Tests that are louder than the training data, and by how much."""
+    return {name: ratio for name, ratio in e.louder.items() if ratio > EXTRAPOLATES}
 
 
-def one_start(e: Evidence) -> Advice | None:
-    """Nothing to compare the minimum with."""
-    said = e.useless and not e.overtrained
-    if e.started > 1 or e.continued or e.known or said or e.validation is None or e.parts_differ:
-        return None  # without validation the start that overfits most would be chosen
-    return Advice(
-        "Try several starts: starts=8.",
-        "one start; fits end in one of several minima",
-        {"starts": 8},
-    )
+def _louder(e: Evidence) -> str:
+    """How loud these are, and how far the starts differ there."""
+    ratios = _listed(f"'{name}' up to {number(ratio)} times" for name, ratio in _far(e).items())
+    apart = max((e.apart.get(name, 0.0) for name in _far(e)), default=0.0)
+    more = f"; by {percent(apart)} of the output's deviation the starts differ there" * bool(apart)
+    return f"the largest input, over that in training: {ratios}{more}"
 
 
-def tests_are_louder(e: Evidence) -> Advice | None:
-    """Tests beyond the amplitudes of the training data."""
-    far = {name: ratio for name, ratio in e.louder.items() if ratio > EXTRAPOLATES}
-    if not far:
-        return None
-    ratios = _listed([f"'{name}' up to {number(ratio)} times" for name, ratio in far.items()])
-    apart = max((e.apart.get(name, 0.0) for name in far), default=0.0)
-    more = (
-        f"; by {percent(apart)} of the output's deviation the starts differ there" if apart else ""
-    )
-    return Advice(
-        "Some tests extrapolate: train on inputs as loud as those the model is for.",
-        f"the largest input, over that in training: {ratios}{more}",
-    )
+def _both_errors(e: Evidence) -> str:
+    error, linear_error, which = e.judged
+    return f"{which} error {percent(error)}, of the linear model {percent(linear_error)}"
 
 
-def choose_sizes(e: Evidence) -> Advice | None:
-    """Sizes that were guessed, and validation records that can choose them."""
-    if e.searched or e.given or e.validation is None or e.parts_differ:
-        return None
-    static = "degree" if e.sizes.get("degree") else "nn"
-    change: dict[str, Any] = dict.fromkeys(["nx", "nz", "nw", static], "auto")
-    return Advice(
-        f"Let the data choose the sizes: {_written(change)}.",
-        "the sizes were given",
-        change,
-    )
-
-
-def noise_unknown(e: Evidence) -> Advice | None:
-    """No telling whether the error is noise."""
-    if e.noise is not None or e.guess is not None or e.train is None or e.structured:
-        return None
-    return Advice(
-        "It is unknown whether the remaining error is noise: measure two periods of a periodic "
-        "input in steady state for training.",
-        f"training error {percent(e.train)} of the output's standard deviation, no repeated "
-        "periods in the training records",
-    )
-
-
-_RULES = (  # the most useful first, and whether a rule is on the sizes or the search
-    (diverges, False),
-    (neither_usable, False),
-    (validation_is_unlike, False),
-    (gain_is_lost, False),
-    (nothing_held_out, False),
-    (starts_in_a_transient, False),
-    (nothing_moves, False),
-    (at_the_noise, False),
-    (nothing_left, False),
-    (overfits, True),
-    (linear_part_incomplete, True),
-    (hardly_better, True),
-    (outputs_left_out, True),
-    (nonlinear_part_incomplete, True),
-    (choose_sizes, True),
-    (best_start_alone, True),
-    (one_start, True),
-    (still_falling, True),
-    (ended_by_limit, True),
-    (tests_are_louder, False),
-)
-
-
-def _larger(e: Evidence, states: Mapping[str, int] = MappingProxyType({})) -> dict[str, int]:
+def _larger(e: Evidence, states: Mapping[str, int] | None = None) -> dict[str, int]:
     """Sizes of a larger static map, and of more states; none if the samples do not bear them."""
     if e.known and not (e.sizes.get("nn") or e.sizes.get("degree")):
         return {"nz": 2, "nw": 1, "nn": 4}
@@ -446,7 +200,8 @@ def _larger(e: Evidence, states: Mapping[str, int] = MappingProxyType({})) -> di
     static = {"degree": e.sizes["degree"] + 2} if e.sizes.get("degree") else {}
     if e.sizes.get("nn"):
         static = {"nn": 2 * e.sizes["nn"]}
-    tried = ({**states, **static, **signals}, {**states, **static})
+    own = {**(states or {}), **static}
+    tried = {**own, **signals}, own
     return next((change for change in tried if change and _borne(e, change)), {})
 
 
@@ -465,20 +220,252 @@ def _weights(sizes: Mapping[str, int]) -> int:
     return max(1, static) * max(1, sizes.get("nx", 0))
 
 
-def _typed(change: Mapping[str, Any]) -> list[str]:
-    """The change as words of the command line."""
-    return [
-        f"trainer.max_iter={value.limit}" if name == "trainer" else f"{name}={value}"
-        for name, value in change.items()
-    ]
+_OF_DATA = {
+    "diverges": Rule(
+        lambda e: bool(e.diverged),
+        lambda e: (
+            "The model is not usable yet: "
+            + "train on inputs as loud as the tests', or " * any(n in _far(e) for n in e.diverged)
+            + f"use {_written(_of_ridge(e)) or ('a larger ridge' if e.ridge else 'ridge=1e-3')}."
+        ),
+        lambda e: f"the NL-LFR diverges on {_listed(map(repr, e.diverged))}",
+        _of_ridge,
+    ),
+    "inputs_explain_little": Rule(
+        lambda e: e.unexplained and not e.diverged,
+        "The inputs explain little of the outputs: look at the columns, delays and units, and for "
+        "other inputs (lfrtorch preview).",
+        "training error {train:%}, of the linear model {linear_train:%}",
+    ),
+    "holds_in_training_alone": Rule(
+        # Said where the parts differ; or the models do not even hold there.
+        lambda e: (
+            e.neither
+            and bool(e.linear_train)
+            and not (e.diverged or e.unexplained)
+            and e.train is not None
+            and not (e.parts_differ or e.train > UNEXPLAINED)
+        ),
+        "The models hold in training alone: the other parts are unlike, too short or at rest, or "
+        "begin in another state (start='estimated').",
+        "training error {train:%}, of the linear model {linear_train:%}",
+    ),
+    "validation_is_unlike": Rule(
+        lambda e: e.parts_differ,
+        "The validation part is unlike the training part: hold out a longer one (validation=0.4), "
+        "or records by name (validation=[NAME]).",
+        "error of the linear model: validation {linear_validation:%}, training {linear_train:%}",
+        words="validation=0.4",
+    ),
+    "gain_is_lost": Rule(
+        lambda e: e.lost_on_tests and not e.parts_differ and not e.neither,
+        "The gain on {judged[2]} is lost on the tests: they are unlike, or the model is overfit; "
+        "hold out a longer part (validation=0.4), or measure longer.",
+        "error over the linear model's: {judged[2]} {gain:%}, tests {tests:%}",
+        words="validation=0.4",
+    ),
+    "nothing_held_out": Rule(
+        lambda e: e.validation is None and e.linear_validation is None and e.train is not None,
+        lambda e: (
+            ("Hold" if e.lost_on_tests else "Overfitting would not show: hold")
+            + " out a part (validation=0.2) to choose iterations and sizes, then fit all with them."
+        ),
+        "{parameters} parameters are fitted to {samples} samples",
+        words="validation=0.2",
+    ),
+    "starts_in_a_transient": Rule(
+        lambda e: _above(e.transient, _TRANSIENT) and _above(e.free, 0.5),
+        "The records do not begin at the model's rest: skip more samples (skip=N), or estimate "
+        "their starts (start='estimated').",
+        "in their first twentieth the training error is {transient} times that of the rest, and a "
+        "free response explains {free:%} of its power",
+        words="start=estimated",
+    ),
+    "nothing_moves": Rule(
+        lambda e: e.settled,
+        "Nothing held out moves: test with another record (test=FILE.csv), or put the part that "
+        "moves last.",
+        "inputs and outputs of all parts that were held out have settled",
+        words="test=FILE.csv",
+    ),
+    "at_the_noise": Rule(
+        lambda e: e.noise_limited,
+        "Noise-limited: nothing to gain from more neurons, states or starts; more data or less "
+        "noise make the model better.",
+        "training error {train:%}, noise {noise:%} of the output's standard deviation",
+    ),
+    "nothing_left": Rule(
+        lambda e: e.nothing_left,
+        "Nothing is left to find: the errors are white, and as large as the noise seems to be.",
+        "training error {train:%}, noise by the quietest part of the spectrum {guess:%} of the "
+        "output's standard deviation",
+    ),
+}
+
+_OF_MODEL = {
+    "overfits": Rule(
+        lambda e: not e.parts_differ and bool(e.searched or not _of_ridge(e)),
+        lambda e: f"Overfit: {'a larger ridge, or ' * e.known}more data.",
+        _overfit,
+    ),
+    "overfits_without_ridge": Rule(
+        lambda e: not e.parts_differ and not e.searched and bool(_of_ridge(e)),
+        "Overfit: {change}, or more data.",
+        _overfit,
+        _of_ridge,
+    ),
+    "linear_part_incomplete": Rule(
+        lambda e: e.states_missing,
+        lambda e: "The linear part is incomplete: {}.".format(
+            f"nx={e.nx + 1} or nx={e.nx + 2} states beside the known ones"
+            if e.known
+            else (f"nx={e.nx + 1}, nx={e.nx + 2} or nx='auto'" if e.nx else "a higher nx")
+        ),
+        "a linear filter of the inputs explains {linear:%} of the error's power",
+        lambda e: {"nx": e.nx + 1} if e.nx or e.known else {},
+    ),
+    "system_is_linear": Rule(
+        lambda e: (
+            _gains_little(e) and not e.better and SOUND <= e.linear_over_noise <= NOISE_LIMITED
+        ),
+        "The system is linear at this level: the linear model is enough.",
+        _both_errors,
+    ),
+    "nothing_at_any_size": Rule(
+        lambda e: (
+            _gains_little(e) and e.linear_over_noise > NOISE_LIMITED and e.searched and not e.better
+        ),
+        "Hardly better than the linear model at any size searched: the system is linear at this "
+        "level, or the rest is no static map of a few signals.",
+        _both_errors,
+    ),
+    "hardly_better": Rule(
+        lambda e: _is_small(e) and not e.better,
+        "Hardly better than the linear model: the system is linear at this level, or the search or "
+        "the sizes are too small: {change}.",
+        _both_errors,
+        _more,
+        instead="more data",
+    ),
+    "gain_is_small": Rule(
+        lambda e: _is_small(e) and e.better,
+        "The gain on {judged[2]} is small; a longer search or larger sizes may have more: "
+        "{change}.",
+        _both_errors,
+        _more,
+        instead="more data",
+    ),
+    "outputs_left_out": Rule(
+        lambda e: (
+            bool(e.behind)
+            and e.gain is not None
+            and not (e.useless or e.lost_on_tests)
+            and _borne(e, _more_outputs(e))
+        ),
+        "Some outputs gain nothing, or are linear: {change}.",
+        lambda e: (
+            f"{e.judged[2]} error "
+            + _listed(f"{number(ratio)} times on '{name}'" for name, ratio in e.behind.items())
+            + " that of the linear model, and less on the others"
+        ),
+        _more_outputs,
+    ),
+    "nonlinear_part_left_at_any_size": Rule(
+        lambda e: _map_is_small(e) and e.searched,
+        "Nonlinear behaviour is left: at any size searched; more data may bear a larger map.",
+        _not_noise,
+    ),
+    "nonlinear_part_incomplete": Rule(
+        lambda e: _map_is_small(e) and not e.searched,
+        "Nonlinear behaviour is left: {change}.",
+        _not_noise,
+        _larger,
+        instead="more data would bear a larger map",
+    ),
+    "choose_sizes": Rule(
+        lambda e: not (e.searched or e.given or e.validation is None or e.parts_differ),
+        "Let the data choose the sizes: {change}.",
+        "the sizes were given",
+        lambda e: dict.fromkeys(
+            ["nx", "nz", "nw", "degree" if e.sizes.get("degree") else "nn"], "auto"
+        ),
+    ),
+    "best_start_alone": Rule(
+        lambda e: _above(e.second, 1.2) and not e.parts_differ,  # beyond it the best may be luck
+        "The minimum may be a poor one: {change}.",
+        "the second best start's error is {second} times that of the best, of {started}",
+        lambda e: {"starts": 2 * max(e.started, 4)},
+    ),
+    "one_start": Rule(
+        # Without validation the start that overfits most would be chosen.
+        lambda e: (
+            not (e.started > 1 or e.continued or e.known or e.validation is None)
+            and not (e.parts_differ or (e.useless and not e.overtrained))
+        ),
+        "Try several starts: {change}.",
+        "one start; fits end in one of several minima",
+        lambda _: {"starts": 8},
+    ),
+    "still_falling": Rule(
+        lambda e: e.falling > FALLING and e.validation is not None,
+        "Still falling: {change}; init_from=RUN goes on from here.",
+        "at the pace of the last iterations the validation error falls by {falling:%} in a tenth "
+        "of the {iterations}",
+        _longer,
+    ),
+    "ended_by_limit": Rule(
+        lambda e: _is_spent(e) and not e.searched,
+        "The limit of {iterations} iterations ended every start: {change}.",
+        "kept iteration {iterations} of {iterations}",
+        _longer,
+    ),
+    "ended_by_limit_of_choice": Rule(
+        lambda e: _is_spent(e) and e.searched,
+        lambda e: (
+            f"The limit of {e.iterations} iterations ended every start: init_from=RUN goes on from "
+            f"here, {_written(_longer(e))}."
+        ),
+        "kept iteration {iterations} of {iterations}; where sizes are chosen the limit is what "
+        "their ridge was chosen with",
+    ),
+}
+
+_OF_USE = {
+    "tests_are_louder": Rule(
+        lambda e: bool(_far(e)),
+        "Some tests extrapolate: train on inputs as loud as those the model is for.",
+        _louder,
+    ),
+}
+
+_LAST = {
+    "noise_unknown": Rule(
+        lambda e: e.noise is None and e.guess is None and e.train is not None and not e.structured,
+        "It is unknown whether the remaining error is noise: measure two periods of a periodic "
+        "input in steady state for training.",
+        "training error {train:%} of the output's standard deviation, no repeated periods in the "
+        "training records",
+    ),
+}
+
+RULES = _OF_DATA | _OF_MODEL | _OF_USE | _LAST
+"""The rules by name, the most useful first; the last one speaks if no other does."""
+
+
+def _words(change: Mapping[str, Any], write: Callable[[Any], str] = str) -> list[str]:
+    """The change as words of the command line, or as one writes it in Python."""
+    limits = {f"{n}.max_iter": v.limit for n, v in change.items() if n == "trainer"}
+    values = limits or change
+    return [f"{name}={write(value)}" for name, value in values.items()]
 
 
 def _written(change: Mapping[str, Any]) -> str:
     """The change as one writes it."""
-    return ", ".join(f"{name}={value!r}" for name, value in change.items())
+    return ", ".join(_words(change, repr))
 
 
-def _listed(items: Sequence[str]) -> str:
+def _listed(items: Iterable[str]) -> str:
     """The first of them, and how many more there are."""
-    more = f" and {len(items) - _FEW} more" if len(items) > _FEW else ""
-    return ", ".join(items[:_FEW]) + more
+    listed = [*items]
+    more = f" and {len(listed) - _FEW} more" * (len(listed) > _FEW)
+    return ", ".join(listed[:_FEW]) + more

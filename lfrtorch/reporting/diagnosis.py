@@ -141,6 +141,27 @@ class Evidence:
         return error / linear_error if linear_error else 0.0
 
     @property
+    def behind(self) -> dict[str, float]:
+        """Outputs that gain nothing over the linear model."""
+        return {name: ratio for name, ratio in self.outputs.items() if ratio > USELESS}
+
+    @property
+    def nx(self) -> int:
+        """States of the linear model, of a known one those beside it."""
+        return self.sizes.get("nx", 0)
+
+    @property
+    def second(self) -> float | None:
+        """The error of the second best start over that of the best."""
+        best, *others = sorted(self.starts) or [0.0]
+        return others[0] / best if others and best > 0 else None
+
+    @property
+    def linear_over_noise(self) -> float:
+        """The linear model's error in training over the noise; infinite if it is not known."""
+        return self.linear_train / self.noise if self.linear_train and self.noise else math.inf
+
+    @property
     def useless(self) -> bool:
         """Whether the NL-LFR is hardly better than the linear model."""
         return self.gain is not None and self.gain > USELESS

@@ -12,8 +12,7 @@ import lfrtorch
 from lfrtorch._support.reasons import Reason
 from lfrtorch.data.records import Channel, Record
 from lfrtorch.fitting.trainer import FitResult, Progress, RestartSummary
-from lfrtorch.reporting import advice
-from lfrtorch.reporting.advice import advise
+from lfrtorch.reporting.advice import RULES, advise
 from lfrtorch.reporting.diagnosis import (
     after_kept,
     chance_of_ratio,
@@ -113,7 +112,7 @@ def test_a_diverging_simulation_is_evidence_and_no_error(fitted):
     lost = with_output(responses[1], np.full_like(responses[1].y_hat, np.inf))
     found = evidence(result, [responses[0], lost])
     assert found.diverged == ["loud"]
-    assert advice.diverges(found) is not None
+    assert RULES["diverges"](found) is not None
     first = with_output(responses[0], np.full_like(responses[0].y_hat, np.nan))
     found = evidence(result, [first, lost])
     assert (found.train, found.linear, found.nonlinear) == (None, None, None)
@@ -217,7 +216,7 @@ def test_what_differs_between_periods_is_noise_if_it_is_steady(noisy: bool, reso
     y_hat = y if noisy else record.y + size * WHITE
     seen = Response(record, "train", {"linear": 0.0 * y, "NL-LFR": y_hat})
     found = evidence(result, [seen], bla=bla)
-    assert (advice.at_the_noise(found) is not None) is noisy
+    assert (RULES["at_the_noise"](found) is not None) is noisy
 
 
 def test_validation_like_the_training_is_not_called_unlike(resonance):
