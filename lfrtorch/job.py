@@ -20,6 +20,7 @@ from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.stage import Job
 from lfrtorch.fitting.stages import STAGES
 from lfrtorch.fitting.trainer import Stop
+from lfrtorch.linear.record_start import decided
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scored_run import scored_run
 
@@ -75,7 +76,7 @@ def identify(
         >>> score["rmse"] < score["lti_rmse"]
         True
     """
-    dataset = _by_use(dataset)
+    dataset = decided(_by_use(dataset))
     with using(ranks) as processes:
         if observer is None:
             observer = LineObserver() if processes.rank == 0 else Observer()

@@ -22,6 +22,7 @@ from lfrtorch.cli.wording import as_words
 from lfrtorch.data.dataset import Dataset
 from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.fitting.settings import Settings
+from lfrtorch.linear.record_start import decided
 from lfrtorch.survey.notes import notes_on
 
 
@@ -89,7 +90,7 @@ def opened(cfg: DictConfig) -> lfrtorch.Model:
 
 def loaded(cfg: DictConfig) -> Dataset:
     """The records; what is to be known of them is printed, and kept for the report."""
-    dataset: Dataset = instantiate(cfg.data)
+    dataset: Dataset = decided(instantiate(cfg.data))
     measured = [record for record in dataset.train if record.source == "file"]
     given = dict(cfg.get("bla") or {})
     if not cfg.get("feedthrough", True):

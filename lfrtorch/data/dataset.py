@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
@@ -40,6 +41,21 @@ class Published:
     unit: str = ""
 
 
+class Undecided(NamedTuple):
+    """A training record with an estimated start that may begin at rest.
+
+    Args:
+        seen: what may tell it: the record without its test part.
+        skip: samples of the training part that do not count if it begins at rest.
+        places: numbers of its parts among the records of a use, by ``"train"``, ``"validation"``
+            and ``"test"``.
+    """
+
+    seen: Record
+    skip: int
+    places: Mapping[str, int]
+
+
 @dataclass(frozen=True)
 class Dataset:
     """Records by use: fitted, chosen on, and scored.
@@ -65,6 +81,7 @@ class Dataset:
             is the sum over the horizon of their means.
         leaderboard: test records as nonlinearbenchmark.org has them scored: cut by the package
             nonlinear_benchmarks, the start state fitted to the samples that it leaves unscored.
+        undecided: training records of which an identification chooses how they begin.
 
     Raises:
         ValueError: something else than records.
@@ -92,6 +109,7 @@ class Dataset:
     seed: int | None = None
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     ahead: Mapping[str, Callable[[Array, Array], Array]] = field(default_factory=dict)
+    undecided: tuple[Undecided, ...] = ()
 
     def __post_init__(self) -> None:
         for use in ("train", "validation", "tests", "selection", "leaderboard"):

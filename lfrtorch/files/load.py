@@ -18,7 +18,7 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.paths import expanded, real
-from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.dataset import Dataset, Undecided
 from lfrtorch.data.periods import find_period, find_transient
 from lfrtorch.data.records import Record
 from lfrtorch.data.score_window import SHORTEST, warm_up
@@ -34,7 +34,6 @@ from lfrtorch.files.measurement import (
 )
 from lfrtorch.files.split import TooShortError, cut
 from lfrtorch.files.table import Columns, NoColumnError, Table
-from lfrtorch.linear.record_start import try_starts
 from lfrtorch.survey.integration import integrators
 
 if TYPE_CHECKING:
@@ -51,9 +50,6 @@ Period = int | Literal["auto"] | None
 EVERYTHING = "all"
 """Value of ``test`` that takes all records."""
 
-_TRIED = 3
-"""Most training records that tell whether all begin in motion: a trial takes some seconds."""
-
 _LEFT_OUT = "left out, as it is too short"
 _SAME = 1e-4  # relative, of sampling frequencies: what printed time stamps leave open
 
@@ -66,6 +62,8 @@ class _Whole:
     path: Path
     stem: str  # of all runs and stretches of the file
     stretch: bool
+    seen: int  # samples that may tell how it begins
+    rest: int | None  # samples that do not count if it begins at rest; None if that is known
 
 
 @typed("path", "inputs", "outputs", "reference")
@@ -122,9 +120,9 @@ def load_records(
             outputs are the states), or ``"periodic"``: every record is cut to whole periods in
             steady state. Default: a record of whole periods
             that has settled from its first sample on is periodic. Other records have an estimated
-            start, whose middle is rest, unless their linear models validate clearly better from
-            rest; a note has both errors of the first three. If all of these are from rest, the
-            others that train are, too. With ``test="all"`` all are from rest.
+            start, whose middle is rest; :func:`lfrtorch.identify` begins those at rest that train
+            and whose linear models validate clearly better so, see ``Dataset.undecided``. With
+            ``test="all"`` all are from rest.
         period: samples of one period of the inputs; ``"auto"`` finds it, ``None`` is none.
         skip: samples at the beginning of every record that are left out of cost and score.
             Default: of records from rest the periods that the output takes to settle, or 5 % if
@@ -187,14 +185,15 @@ def load_records(
             f"the fractions are validation={validation} and test={test}; they must leave something "
             "for training, for example 0.2 and 0.2."
         )
-    train = [whole.record for whole in left]
-    reader.find_rest(train)
-    tests, chosen, train = map(reader.in_motion, (tests, chosen, train))
     parts: dict[str, list[Record]] = {"train": [], "validation": chosen, "test": tests}
-    short = None
-    for whole, own in zip(left, train, strict=True):
+    short, undecided = None, []
+    for whole in left:
         try:
-            for use, record in cut(own, validated, tested).items():
+            own = cut(whole.record, validated, tested)
+            if whole.rest is not None and own["train"].samples - whole.rest >= SHORTEST:
+                places = {use: len(parts[use]) for use in own}
+                undecided.append(Undecided(whole.record[: whole.seen], whole.rest, places))
+            for use, record in own.items():
                 parts[use].append(record)
         except TooShortError as error:
             if not whole.stretch:
@@ -212,7 +211,8 @@ def load_records(
     for use, records in parts.items():
         if len(records) == 1:
             parts[use] = [replace(records[0], name=use)]
-    return Dataset(name, parts["train"], parts["validation"], parts["test"], notes=reader.notes)
+    train, chosen, tests = parts.values()
+    return Dataset(name, train, chosen, tests, notes=reader.notes, undecided=tuple(undecided))
 
 
 class _Reader:
@@ -237,7 +237,6 @@ class _Reader:
         self.limits, self.validation, self.unseen = limits, validation, test
         self.start: Start = start
         self.all: list[_Whole] = []
-        self._open: set[str] = set()  # names of records that may be at rest or in motion
         self._first: Measurement | None = None
         self._notes: dict[str, list[str]] = {}
 
@@ -273,48 +272,20 @@ class _Reader:
                 place += [str(count[stretch.run])] if runs[stretch.run] > 1 else []
                 name = "_".join([stem, *place])
                 try:
-                    record, notes = self._record(name, measured, stretch)
+                    record, rest = self._record(name, measured, stretch)
                 except TooShortError as error:
                     if not several:
                         raise InputError(f"'{path}': {error}") from error
                     self.note(name, _LEFT_OUT)
                 else:
-                    self.note(name, *notes)
-                    found.append(_Whole(record, path, stem, several))
+                    seen = self._seen(record.samples)
+                    found.append(_Whole(record, path, stem, several, seen, rest))
             if len(found) == before:
                 raise InputError(
                     f"'{path}': no run or stretch between gaps is long enough to score."
                 )
         self.all += found
         return found
-
-    def find_rest(self, train: Sequence[Record]) -> None:
-        """Decide which records that train begin at rest, each by itself as far as it is tried."""
-        resting, undecided = list[str](), [r for r in train if r.name in self._open]
-        for record in undecided[:_TRIED]:
-            seen = record[: record.samples - round(record.samples * self.unseen)]
-            try:
-                trial = try_starts(seen)
-            except InputError:
-                self.note(record.name, "start is zero: no linear model tells how it begins")
-                resting.append(record.name)
-            else:
-                self.note(record.name, str(trial))
-                resting += [record.name] * (trial.chosen == "zero")
-        if len(undecided) > _TRIED:
-            all_rest = len(resting) == _TRIED
-            resting += [r.name for r in undecided[_TRIED:]] * all_rest
-            start = "zero" if all_rest else "estimated"
-            self.note("", f"start is {start} for the records after the first {_TRIED}, too")
-        self._open -= {*resting}
-
-    def in_motion(self, records: Sequence[Record]) -> list[Record]:
-        """Records with an estimated start where rest is not decided."""
-        skip = self.skip or 0
-        return [
-            replace(record, start="estimated", skip=skip) if record.name in self._open else record
-            for record in records
-        ]
 
     def _measured(self, source: Path | Table) -> Measurement:
         """What a file measured, checked to be of a kind with the first."""
@@ -345,10 +316,10 @@ class _Reader:
 
     def _record(
         self, name: str, measured: Measurement, stretch: Stretch
-    ) -> tuple[Record, list[str]]:
-        """The record of a stretch, and what was found of its period."""
+    ) -> tuple[Record, int | None]:
+        """The record of a stretch, and samples that do not count if it is at rest, if it may be."""
         u, y, r, T = stretch.u, stretch.y, stretch.reference, len(stretch.u)
-        seen = y[: T - round(T * self.unseen)]  # outputs of the test choose nothing
+        seen = y[: self._seen(T)]
         automatic = self.period == "auto"
         N = find_period(u if r is None else r) if automatic else cast("int | None", self.period)
         start: Start = self.start
@@ -391,7 +362,6 @@ class _Reader:
                     f"record '{name}' has {max(T - skip, 0)} scored samples of {T}, with "
                     f"skip={skip}; it needs {SHORTEST}: give a longer record or a smaller skip=N."
                 )
-        notes = []
         if N is not None and (automatic or settling):
             said = f"the input repeats every {N} samples, {T / N:.3g} times"
             count = settling // N
@@ -402,9 +372,10 @@ class _Reader:
             elif settled and self.start != "periodic":
                 said += "; the output is settled from the first sample on: "
                 said += "start is periodic" if start == "periodic" else "use start='periodic'"
-            notes.append(said)
+            self.note(name, said)
+        rest = skip if undecided else None
         if undecided:
-            self._open.add(name)
+            start, skip = "estimated", self.skip or 0
         record = Record(
             u[kept],
             y[kept],
@@ -420,7 +391,11 @@ class _Reader:
             reference=None if r is None else r[kept],
             valid=None if stretch.valid is None else stretch.valid[kept],
         )
-        return record, notes
+        return record, rest
+
+    def _seen(self, T: int) -> int:
+        """Samples that choose how a record begins: outputs of the test do not."""
+        return T - round(T * self.unseen)
 
     def _whole_periods(self, T: int, N: int) -> bool:
         """Whether a record is made of periods, of which each of its parts has one at least."""

@@ -1,5 +1,6 @@
 """Whether a record begins at rest or in motion: the start by which a linear model predicts better.
 
+A file does not say it, and an identification decides it once, of the records that train.
 Two models are estimated from the first three quarters of the record, one from rest and one with an
 estimated start state. The last quarter, simulated from the record's start as well, judges them.
 """
@@ -13,6 +14,7 @@ import numpy as np
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import percent
+from lfrtorch.data.dataset import Dataset
 from lfrtorch.data.metrics import rms
 from lfrtorch.data.records import Record
 from lfrtorch.data.score_window import SHORTEST, warm_up
@@ -23,6 +25,9 @@ _LONGEST = 3000
 
 _JUDGED = 1 / 4
 """Their part that judges."""
+
+_TRIED = 3
+"""Most training records that tell whether all begin in motion: a trial takes some seconds."""
 
 _ORDERS = range(1, 5)
 _ITERATIONS = 15
@@ -95,3 +100,37 @@ def try_starts(record: Record) -> StartTrial:
         for start, judge in judges.items()
     }
     return StartTrial(error("zero"), error("estimated"))
+
+
+def decided(dataset: Dataset) -> Dataset:
+    """Begin training records at rest that are undecided and clearly better so; notes say it."""
+    open_, resting, notes = dataset.undecided, [], []
+    for one in open_[:_TRIED]:
+        name = f"{one.seen.name}: " if len(dataset.train) > 1 else ""
+        try:
+            trial = try_starts(one.seen)
+        except InputError:
+            notes.append(f"{name}start is zero: no linear model tells how it begins")
+            resting.append(one)
+        else:
+            notes.append(f"{name}{trial}")
+            resting += [one] * (trial.chosen == "zero")
+    if len(open_) > _TRIED:
+        all_rest = len(resting) == _TRIED
+        resting += open_[_TRIED:] * all_rest
+        start = "zero" if all_rest else "estimated"
+        notes.append(f"start is {start} for the records after the first {_TRIED}, too")
+    uses = {
+        "train": [*dataset.train],
+        "validation": [*dataset.validation],
+        "test": [*dataset.tests],
+    }
+    for one in resting:
+        for use, i in one.places.items():
+            skip = one.skip if use == "train" else uses[use][i].skip
+            uses[use][i] = replace(uses[use][i], start="zero", skip=skip)
+    train, validation, tests = uses.values()
+    said = (*dataset.notes, *notes)
+    return replace(
+        dataset, train=train, validation=validation, tests=tests, notes=said, undecided=()
+    )

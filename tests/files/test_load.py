@@ -12,14 +12,14 @@ import pytest
 import scipy.io
 import scipy.signal
 
-from lfrtorch import load_records
+from lfrtorch import LevenbergMarquardt, Settings, identify, load_records
 from lfrtorch.data.excitation import multisine
 from lfrtorch.data.records import Channel
-from lfrtorch.files import load
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.glance import look_at
 from lfrtorch.files.text import TextTable
-from lfrtorch.linear.record_start import StartTrial
+from lfrtorch.linear import record_start
+from lfrtorch.linear.record_start import StartTrial, decided
 
 SAMPLES = 200
 USE: dict[str, Any] = {"inputs": ["u1", "u2"], "outputs": "y", "fs": 50.0, "start": "zero"}
@@ -877,25 +877,25 @@ def starts(data) -> list[tuple[str, int]]:
 @pytest.mark.numeric
 def test_a_record_in_motion_has_an_estimated_start(tmp_path):
     table = cut_out(tmp_path / "a.csv", 1000)
-    data = load_records(tmp_path / "a.csv", **AUTO)
+    data = decided(load_records(tmp_path / "a.csv", **AUTO))
     assert starts(data) == [("estimated", 0), ("estimated", 240), ("estimated", 320)]
     (note,) = data.notes
     assert "from rest and at" in note
     assert note.endswith("with an estimated start: start is estimated")
     table[-80:, 1] = 1e3  # outputs of the test choose nothing
     write(tmp_path / "b.csv", table, "u,y")
-    other = load_records(tmp_path / "b.csv", **AUTO)
+    other = decided(load_records(tmp_path / "b.csv", **AUTO))
     assert (starts(other), other.notes) == (starts(data), data.notes)
-    skipping = load_records(tmp_path / "a.csv", **AUTO, skip=7, test=0)
+    skipping = decided(load_records(tmp_path / "a.csv", **AUTO, skip=7, test=0))
     assert starts(skipping) == [("estimated", 7), ("estimated", 320)]
-    everything = load_records(tmp_path / "a.csv", **AUTO, test="all")
+    everything = decided(load_records(tmp_path / "a.csv", **AUTO, test="all"))
     assert (starts(everything), everything.notes) == ([("zero", 20)], ())
 
 
 @pytest.mark.numeric
 def test_a_record_from_rest_has_an_estimated_start_that_does_no_harm(tmp_path):
     cut_out(tmp_path / "a.csv", 0)
-    data = load_records(tmp_path / "a.csv", **AUTO, test=0)
+    data = decided(load_records(tmp_path / "a.csv", **AUTO, test=0))
     assert starts(data) == [("estimated", 0), ("estimated", 320)]
     assert data.notes[0].endswith("no harm at rest either: start is estimated")
 
@@ -912,17 +912,32 @@ def test_each_record_begins_by_itself_and_those_not_tried_as_all_that_are(
         tried.append(record.name)
         return StartTrial(0.5 if record.name in resting else 1.0, 1.0)
 
-    monkeypatch.setattr(load, "try_starts", trial)
+    monkeypatch.setattr(record_start, "try_starts", trial)
     for name in ("run0", "run1", "run2", "run3", "run4", "test"):
         write(tmp_path / f"{name}.csv", signals)
     use = USE | {"start": "auto", "validation": 1, "test": tmp_path / "test.csv"}
-    data = load_records(tmp_path / "run*.csv", **use)
+    read = load_records(tmp_path / "run*.csv", **use)
+    assert not tried  # a file that is read is not fitted
+    assert [r.start for r in read.train] == ["estimated"] * 4
+    data = decided(read)
+    assert not data.undecided
     wanted = ["zero" if f"run{i}" in resting else "estimated" for i in range(3)]
     assert [r.start for r in data.train] == [*wanted, others]
     # What does not train tells by itself where it begins, in the samples that a score leaves out.
     assert [r.start for r in (*data.validation, *data.tests)] == ["estimated", "estimated"]
     assert data.notes[-1] == f"start is {others} for the records after the first 3, too"
     assert tried == ["run0", "run1", "run2"]
+
+
+def test_parts_of_a_record_from_rest_begin_with_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(record_start, "try_starts", lambda _: StartTrial(0.5, 1.0))
+    cut_out(tmp_path / "a.csv", 0)
+    data = decided(load_records(tmp_path / "a.csv", **AUTO))
+    assert starts(data) == [("zero", 20), ("zero", 240), ("zero", 320)]
+    run = Settings(nx=1, nz=1, nn=2, trainer=LevenbergMarquardt(max_iter=1))
+    found = identify(load_records(tmp_path / "a.csv", **AUTO), run)
+    assert starts(found.dataset) == starts(data)
+    assert found.dataset.notes == data.notes
 
 
 @pytest.mark.numeric
@@ -942,7 +957,7 @@ def test_whole_periods_in_steady_state_are_periodic(tmp_path):
     write(tmp_path / "a.csv", table, "u,y")
     assert starts(load_records(tmp_path / "a.csv", **AUTO))[0][0] != "periodic"
     periodic(tmp_path / "a.csv", 5)
-    data = load_records(tmp_path / "a.csv", **AUTO)
+    data = decided(load_records(tmp_path / "a.csv", **AUTO))
     assert starts(data)[0] == ("zero", N)  # the transient is left out, and tells enough
     assert not any("from rest and at" in note for note in data.notes)
 
@@ -951,7 +966,7 @@ def test_a_record_that_tells_nothing_is_from_rest(tmp_path):
     cut_out(tmp_path / "a.csv", 1000, samples=30)
     write(tmp_path / "b.csv", np.ones((100, 2)), "u,y")
     for name in "ab":
-        data = load_records(tmp_path / f"{name}.csv", **AUTO, validation=0, test=0)
+        data = decided(load_records(tmp_path / f"{name}.csv", **AUTO, validation=0, test=0))
         assert data.train[0].start == "zero"
         assert data.notes == ("start is zero: no linear model tells how it begins",)
 
@@ -962,9 +977,9 @@ def test_gaps_and_references_hinder_no_choice(tmp_path):
     table = np.hstack([table, table[:, :1]])
     table[300, 1] = np.nan
     write(tmp_path / "a.csv", table, "u,y,r")
-    data = load_records(tmp_path / "a.csv", **AUTO, gaps="split", test=0)
+    data = decided(load_records(tmp_path / "a.csv", **AUTO, gaps="split", test=0))
     assert [r.start for r in data.train] == ["estimated"] * 2
-    data = load_records(tmp_path / "a.csv", **AUTO, reference="r", test=0)
+    data = decided(load_records(tmp_path / "a.csv", **AUTO, reference="r", test=0))
     assert data.train[0].start == "estimated"
 
 
