@@ -76,7 +76,9 @@ def identify(
         >>> score["rmse"] < score["lti_rmse"]
         True
     """
-    dataset = decided(_by_use(dataset))
+    dataset = _by_use(dataset)
+    if dataset.undecided:
+        dataset = decided(dataset)
     with using(ranks) as processes:
         if observer is None:
             observer = LineObserver() if processes.rank == 0 else Observer()

@@ -18,8 +18,8 @@ from lfrtorch.cli.wording import as_words
 from lfrtorch.data.periods import find_period
 from lfrtorch.data.records import Record, check_rate
 from lfrtorch.files.formats import open_table
-from lfrtorch.files.glance import Glance, look_at
 from lfrtorch.files.load import EVERYTHING, is_fraction, listed_files, stem_of
+from lfrtorch.files.measurement import Measurement, look_at
 from lfrtorch.linear.record_start import try_starts
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.measurement import survey_measurement
@@ -75,7 +75,7 @@ def show(path: Path, data: DictConfig, figure: Path) -> None:
     seen = look_at(table, data.inputs, data.outputs, time=data.time, fs=data.fs)
     found = survey_measurement(seen.u, seen.y, seen.fs, inputs=seen.inputs, outputs=seen.outputs)
     sentences = [*seen.doubts, *(note.text for note in examine(found, seen.u, seen.y))]
-    remarks = [*seen.remarks]
+    remarks = [*seen.notes]
     if seen.fs is None:
         remarks.append("no sampling frequency: give fs=HZ; frequencies are in cycles/sample")
     if not seen.inputs:
@@ -98,7 +98,7 @@ def show(path: Path, data: DictConfig, figure: Path) -> None:
     print(f"\nFigure in {figure}\n")
 
 
-def beginning(seen: Glance, test: Any) -> list[str]:
+def beginning(seen: Measurement, test: Any) -> list[str]:
     """How a fit would take the record to begin, if its linear models tell that."""
     T = len(seen.y) - (round(test * len(seen.y)) if is_fraction(test) else 0)
     u, y = seen.u[:T], seen.y[:T]

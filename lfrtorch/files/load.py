@@ -299,6 +299,8 @@ class _Reader:
         if self._first is None:
             self._first = measured
         first = self._first
+        assert first.fs
+        assert measured.fs
         for side in ("inputs", "outputs"):
             here, there = getattr(measured, side), getattr(first, side)
             if here != there:
@@ -319,6 +321,7 @@ class _Reader:
     ) -> tuple[Record, int | None]:
         """The record of a stretch, and samples that do not count if it is at rest, if it may be."""
         u, y, r, T = stretch.u, stretch.y, stretch.reference, len(stretch.u)
+        assert measured.fs
         seen = y[: self._seen(T)]
         automatic = self.period == "auto"
         N = find_period(u if r is None else r) if automatic else cast("int | None", self.period)

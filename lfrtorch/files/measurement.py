@@ -1,4 +1,8 @@
-"""What one file measured: inputs and outputs on an even grid of time, run by run."""
+"""What one file measured: the roles of its columns, their clock, and signals on an even grid.
+
+:func:`read_measurement` refuses what a model cannot be fitted to; :func:`look_at` takes the
+beginning of any file, and says what is odd.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +18,18 @@ from numpy.typing import NDArray
 
 from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.runs import find_runs, is_run
 from lfrtorch._support.sampling import Piece
 from lfrtorch._support.types import Array, Booleans
-from lfrtorch.data.records import Channel, interpolated
+from lfrtorch.data.records import Channel, check_largest, check_rate, interpolated
 from lfrtorch.files.formats import Table, open_table
-from lfrtorch.files.table import Columns
-from lfrtorch.files.time_base import OnGrid, find_base, on_grid
+from lfrtorch.files.table import BLOCK, Columns
+from lfrtorch.files.time_base import OnGrid, TimeBase, find_base, on_grid
 
 Gaps = Literal["error", "split"]
+
+LARGEST = 2**22
+"""Values that a first look reads, of all channels together."""
 
 
 @dataclass(frozen=True)
@@ -52,65 +60,59 @@ class Stretch(NamedTuple):
     valid: Booleans | None = None  # (T, ny): False for outputs without a value, interpolated
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Measurement:
     """One file."""
 
     path: Path
-    fs: float
+    fs: float | None  # Hz, which a first look may not know
     inputs: tuple[Channel, ...]
-    outputs: tuple[Channel, ...]
-    stretches: list[Stretch]
-    notes: list[str]
+    outputs: tuple[Channel, ...]  # of a first look all signals, if none was named
+    stretches: list[Stretch]  # of a first look the longest run, NaN where a value is missing
+    notes: list[str]  # what was taken for what
+    doubts: list[str] = field(default_factory=list)  # what is wrong with the times
+
+    @property
+    def u(self) -> Array:
+        """Inputs of the first stretch, (T, nu)."""
+        return self.stretches[0].u
+
+    @property
+    def y(self) -> Array:
+        """Outputs of the first stretch, (T, ny)."""
+        return self.stretches[0].y
+
+
+class _Roles(NamedTuple):
+    """Numbers of the columns."""
+
+    u: tuple[int, ...]
+    y: tuple[int, ...]
+    r: tuple[int, ...]
+    stamps: tuple[int, ...]
 
 
 def read_measurement(source: Path | Table, wanted: Wanted) -> Measurement:
     """Read inputs, outputs and sampling frequency of a file; refuse gaps, unless to be split."""
     table = source if isinstance(source, Table) else open_table(source)
-    path = table.path
-    inputs, outputs, told = table.by_name(wanted.inputs, wanted.outputs)
-    u = table.find(inputs, "inputs")
-    y = table.find(outputs, "outputs")
-    r = () if wanted.reference is None else table.find(wanted.reference, "reference")
-    if r and len(r) != len(u):
-        raise InputError(
-            f"reference is {wanted.reference!r}, {len(r)} column(s) for {len(u)} input(s); name "
-            "one for each input."
-        )
-    stamps = () if wanted.time is None else table.find(wanted.time, "time")
-    if len(stamps) > 1:
-        raise InputError(f"time is {wanted.time!r}, which is {len(stamps)} columns; name one.")
+    (u, y, r, stamps), told = _roles(table, wanted, needed=True)
     columns = (*u, *y, *r, *stamps)
-    twice = [table.headers[i] for i, count in Counter(columns).items() if count > 1]
-    if twice:
-        raise InputError(
-            f"'{path}': {', '.join(map(repr, twice))} stands twice in inputs, outputs, "
-            "reference and time; name every column once."
-        )
     base = find_base(table, columns, fs=wanted.fs, stamps=stamps)
     if base.fs is None and not base.given:
         raise InputError(
-            f"the sampling frequency of '{path}' is not known; give fs=HZ"
+            f"the sampling frequency of '{table.path}' is not known; give fs=HZ"
             f"{'; ' if base.why else ''}{base.why}."
         )
+    channels = _channels(table, (*u, *y), wanted.units)
     beside = () if base.column is None or base.column in columns else (base.column,)
     if beside and wanted.fs is None:
         columns, beside = (*columns, *beside), ()
-    known = {name for i in (*u, *y) for name in (table.headers[i], table.columns[i].name, i)}
-    strange = [name for name in wanted.units if name not in known]
-    if strange:
-        raise InputError(
-            f"units names {', '.join(map(repr, strange))}, which is none of the inputs and "
-            f"outputs: {', '.join(table.columns[i].name for i in (*u, *y))}."
-        )
     try:
         values = table.read((*columns, *beside))
     except InputError:  # further on than was looked at, what is beside may have words
         base, beside = base._replace(column=None), ()
         values = table.read(columns)
-    present = np.flatnonzero(~np.isnan(values[:, : len(columns)]).all(axis=1))
-    values = values[: present[-1] + 1 if present.size else 0]  # spreadsheets end in empty lines
-    values, t = values[:, : len(columns)], values[:, -1]
+    values, t = _to_the_end(values, len(columns))
     _refuse_infinite(table, values, columns)
     ends = np.cumsum([0, len(u), len(y), len(r)])
     parts = [slice(a, b) for a, b in pairwise(ends)]
@@ -135,9 +137,8 @@ def read_measurement(source: Path | Table, wanted: Wanted) -> Measurement:
         for stretch in _stretches(values, pieces, parts, wanted.gaps, name)
     ]
     if not stretches:
-        raise InputError(f"'{path}' has no sample in which all columns have a value.")
-    assert grid.fs is not None
-    notes = [*base.notes, *grid.notes]
+        raise InputError(f"'{table.path}' has no sample in which all columns have a value.")
+    notes = [*table.notes, *told, *base.notes, *grid.notes]
     empty = np.isnan(values[:, parts[1]])
     if wanted.gaps == "error" and empty.any():
         sample, i = np.argwhere(empty)[0]
@@ -146,14 +147,162 @@ def read_measurement(source: Path | Table, wanted: Wanted) -> Measurement:
             f"{table.where(int(sample))} in column {table.headers[y[i]]!r}: they are simulated "
             "through, and neither fitted nor scored"
         )
-    return Measurement(
-        path,
-        grid.fs,
-        _channels(table, u, wanted.units),
-        _channels(table, y, wanted.units),
-        stretches,
-        [*table.notes, *told, *notes],
+    nu = len(u)
+    return Measurement(table.path, grid.fs, channels[:nu], channels[nu:], stretches, notes)
+
+
+def look_at(
+    table: Table,
+    inputs: Columns | None = None,
+    outputs: Columns | None = None,
+    *,
+    time: str | int | None = None,
+    fs: float | None = None,
+) -> Measurement:
+    """Read the first samples of a file; without inputs and outputs, of all signals."""
+    # If one side is given, the other columns are the other side.
+    u, y, base, remarks = _guessed(table, Wanted(inputs, outputs, fs, time))
+    columns, doubts = (*u, *y), [base.why] if base.why else []
+    read = columns if base.column is None else (*columns, base.column)
+    values, more = _beginning(table, read)
+    values, t = _to_the_end(values, len(columns) + (fs is None))
+    if not len(values):
+        raise InputError(f"'{table.path}' has no values in the columns to show.")
+    try:
+        timed = base.column is not None and (base.fs is not None or base.given)
+        grid = on_grid(table, base, len(values), t if timed else None, fs=fs, used=columns)
+    except InputError as error:
+        doubts.append(str(error).partition(": ")[2])
+        grid = on_grid(table, TimeBase(fs), len(values), fs=fs, used=columns)
+    (remarks if fs is None else doubts).extend(base.notes)
+    remarks += grid.notes
+    if more:
+        remarks.append(f"the first {len(values)} samples are read, and no more")
+    longest = max(grid.pieces, key=lambda run: sum(len(piece.rows) for piece in run))
+    name = grid.runs.names[grid.pieces.index(longest)]
+    if len(grid.pieces) > 1:
+        remarks.append(f"what follows is of the longest run, {name}")
+    if grid.holes[0]:
+        doubts.append(f"{grid.gap(table)}: data.gaps=split cuts the record there")
+    signals = _joined(longest, values[:, : len(columns)], len(u))
+    for i, signal in zip(columns, signals.T, strict=True):
+        known = np.abs(signal[np.isfinite(signal)])
+        check_largest(f"'{table.path}': {table.columns[i].name!r}", known.max(initial=0.0))
+    if grid.fs is not None:
+        check_rate(f"'{table.path}': the sampling frequency", grid.fs)
+    channels, nu = _channels(table, columns, {}), len(u)
+    whole = [Stretch(signals[:, :nu], signals[:, nu:], begins=True, run=name)]
+    notes = [*table.notes, *remarks]
+    return Measurement(table.path, grid.fs, channels[:nu], channels[nu:], whole, notes, doubts)
+
+
+def _roles(table: Table, wanted: Wanted, *, needed: bool) -> tuple[_Roles, list[str]]:
+    """Columns that are named, or whose names leave no doubt, and a note on these."""
+    inputs, outputs, told = wanted.inputs, wanted.outputs, list[str]()
+    if needed or (inputs is None and outputs is None):
+        inputs, outputs, told = table.by_name(inputs, outputs)
+    sides = {"inputs": inputs, "outputs": outputs}
+    sides |= {"reference": wanted.reference, "time": wanted.time}
+    found = _Roles(
+        *(
+            table.find(columns, side)
+            if columns is not None or (needed and side in ("inputs", "outputs"))
+            else ()
+            for side, columns in sides.items()
+        )
     )
+    if found.r and len(found.r) != len(found.u):
+        raise InputError(
+            f"reference is {wanted.reference!r}, {len(found.r)} column(s) for {len(found.u)} "
+            "input(s); name one for each input."
+        )
+    if len(found.stamps) > 1:
+        raise InputError(
+            f"time is {wanted.time!r}, which is {len(found.stamps)} columns; name one."
+        )
+    named = Counter(i for side in found for i in side)
+    twice = [table.headers[i] for i, count in named.items() if count > 1]
+    if twice:
+        raise InputError(
+            f"'{table.path}': {', '.join(map(repr, twice))} stands twice in inputs, outputs, "
+            "reference and time; name every column once."
+        )
+    return found, told
+
+
+def _guessed(
+    table: Table, wanted: Wanted
+) -> tuple[tuple[int, ...], tuple[int, ...], TimeBase, list[str]]:
+    """Inputs and outputs, what tells their times, and remarks on the choice."""
+    (u, y, _, stamps), remarks = _roles(table, wanted, needed=False)
+    named = [*u, *y, *stamps]
+    if not table.contents:
+        remarks += [f"left out: {name!r} {reason}" for name, reason in table.refused.items()]
+    rest = [i for i in range(len(table.columns)) if i not in named]
+    if table.lengths:
+        counted = Counter(table.lengths[i] for i in named or rest)
+        usual = max(counted, key=lambda T: (counted[T], T), default=0)
+        short = [table.columns[i].name for i in rest if table.lengths[i] != usual]
+        rest = [i for i in rest if table.lengths[i] == usual]
+        if short:
+            remarks.append(f"left out: {', '.join(short)}, of other lengths than {usual} samples")
+    heads = dict[int, Array]()
+    for i in rest:
+        try:
+            heads[i] = next(table.blocks([i], BLOCK))[:, 0]
+        except InputError as error:
+            remarks.append(f"left out: {error}")
+    used = named or [i for i in range(len(table.columns)) if i not in rest]
+    base = find_base(table, used, fs=wanted.fs, stamps=stamps)
+    others = tuple(
+        i
+        for i, head in heads.items()
+        if i not in (base.column, *base.others)
+        and not (is_run(table.columns[i].name) and find_runs(len(head), {"": head}).told)
+    )
+    if bool(u) != bool(y):
+        side = "outputs" if u else "inputs"
+        names = ", ".join(table.columns[i].name for i in others)
+        remarks.append(
+            f"{side}: {names}, all other columns" if others else f"no column is left for {side}"
+        )
+    u, y = u or (others if y else ()), y or others
+    if not y:
+        lacking = "no column is left for the outputs" if u else "there is no column to show"
+        raise InputError(f"'{table.path}': {lacking}; it has {table.listed}.")
+    return u, y, base, remarks
+
+
+def _beginning(table: Table, columns: Sequence[int]) -> tuple[Array, bool]:
+    """The first samples (T, columns), and whether there are more."""
+    most = LARGEST // len(columns)
+    blocks, T = [np.empty((0, len(columns)))], 0
+    for block in table.blocks(columns):
+        blocks.append(block[: most - T])
+        T += len(block)
+        if most < T:
+            break
+    return np.concatenate(blocks), most < T
+
+
+def _to_the_end(values: Array, count: int) -> tuple[Array, Array]:
+    """The first columns and the last one, without the empty lines that spreadsheets end in."""
+    present = np.flatnonzero(~np.isnan(values[:, :count]).all(axis=1))
+    values = values[: present[-1] + 1 if present.size else 0]
+    return values[:, :count], values[:, -1]
+
+
+def _joined(pieces: Sequence[Piece], signals: Array, nu: int) -> Array:
+    """The signals of a run on its grid, NaN in its holes as far as these are not too long."""
+    found, end = [], 0.0
+    for piece in pieces:
+        hole = min(round(piece.start - end), LARGEST // signals.shape[1]) if found else 0
+        part, lost = piece.on_grid(signals), piece.missing()
+        if lost.any():
+            part[lost, nu:] = np.nan
+        found += [np.full((hole, signals.shape[1]), np.nan), part]
+        end = piece.start + len(part)
+    return np.concatenate(found)
 
 
 def _stretches(
@@ -191,12 +340,17 @@ def _channels(
     table: Table, columns: Sequence[int], units: Mapping[str | int, str]
 ) -> tuple[Channel, ...]:
     """Channels with the units that are given by name, by header or by number."""
-    found = []
-    for i in columns:
-        channel = table.columns[i]
-        given = (units[key] for key in (channel.name, table.headers[i], i) if key in units)
-        found.append(Channel(channel.name, next(given, channel.unit)))
-    return tuple(found)
+    keys = [(table.columns[i].name, table.headers[i], i) for i in columns]
+    strange = [key for key in units if not any(key in own for own in keys)]
+    if strange:
+        raise InputError(
+            f"units names {', '.join(map(repr, strange))}, which is none of the inputs and "
+            f"outputs: {', '.join(name for name, *_ in keys)}."
+        )
+    return tuple(
+        Channel(own[0], next((units[key] for key in own if key in units), table.columns[i].unit))
+        for i, own in zip(columns, keys, strict=True)
+    )
 
 
 def _refuse_infinite(table: Table, values: NDArray, columns: Sequence[int]) -> None:

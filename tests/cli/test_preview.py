@@ -15,9 +15,9 @@ from scipy.signal import lfilter
 from lfrtorch._support.tables import number
 from lfrtorch.cli import config, preview
 from lfrtorch.data.records import Channel
-from lfrtorch.files import glance
+from lfrtorch.files import measurement
 from lfrtorch.files.formats import open_table
-from lfrtorch.files.glance import look_at
+from lfrtorch.files.measurement import look_at
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.measurement import survey_measurement
 from lfrtorch.survey.notes import examine
@@ -262,11 +262,11 @@ def test_a_column_of_text_is_left_out(tmp_path: Path, run):
 
 @pytest.mark.usefixtures("undrawn")
 def test_only_the_beginning_of_a_long_file_is_read(file: Path, run, monkeypatch):
-    monkeypatch.setattr(glance, "LARGEST", 3 * 700)
+    monkeypatch.setattr(measurement, "LARGEST", 3 * 700)
     out = run(file, "data.inputs=[force]", "data.outputs=[level]")
     assert "the first 700 samples are read, and no more" in out
     assert f"{file}: 700 samples" in out
-    monkeypatch.setattr(glance, "LARGEST", 3 * T)
+    monkeypatch.setattr(measurement, "LARGEST", 3 * T)
     assert "no more" not in run(file, "data.inputs=[force]", "data.outputs=[level]")
 
 
@@ -313,7 +313,10 @@ def test_the_command_line_of_a_fit_is_that_of_a_preview(file: Path, signals, run
     ("words", "message"),
     [
         (["data.inputs=mass"], "has no column 'mass', named in inputs"),
-        (["data.inputs=force", "data.outputs=force"], "'force (N)' stands for several"),
+        (
+            ["data.inputs=force", "data.outputs=force"],
+            "'force (N)' stands twice in inputs, outputs",
+        ),
         (["data.inputs=[force,level]", "data.time=time"], "no column is left for the outputs;"),
         (["out=x.csv"], "out is 'x.csv'; give a name that ends with .png"),
         (["nothing*.csv"], "no file matches 'nothing*.csv'"),

@@ -16,7 +16,7 @@ from lfrtorch import LevenbergMarquardt, Settings, identify, load_records
 from lfrtorch.data.excitation import multisine
 from lfrtorch.data.records import Channel
 from lfrtorch.files.formats import open_table
-from lfrtorch.files.glance import look_at
+from lfrtorch.files.measurement import look_at
 from lfrtorch.files.text import TextTable
 from lfrtorch.linear import record_start
 from lfrtorch.linear.record_start import StartTrial, decided
@@ -437,7 +437,7 @@ def test_no_sampling_frequency(tmp_path):
     assert data.train[0].fs == 20.0
     assert data.notes[0] == "the column 'x' is taken for the time, 20 Hz"
     seen = look_at(open_table(path), "u", "y")  # a first look has the same rule
-    assert (seen.fs, seen.remarks) == (20.0, ["the column 'x' is taken for the time, 20 Hz"])
+    assert (seen.fs, seen.notes) == (20.0, ["the column 'x' is taken for the time, 20 Hz"])
     write(path, both[:, [0, 2, 3]], "n,u,y")
     refused(r"is not known; give fs=HZ\.$", path, use=BARE)
     write(path, both[:, [3, 2, 3]], "t,u,y")
@@ -1097,7 +1097,7 @@ def test_a_column_of_dates_is_the_time_whatever_its_name(tmp_path, signals):
     table.assign(begun=stamps.map(lambda stamp: stamp.isoformat())).to_csv(tmp_path / "a.csv")
     data = load_records(tmp_path / "a.csv", **BARE, test="all")
     assert data.notes[0] == "the column 'begun' is taken for the time, 1 Hz"
-    assert look_at(open_table(tmp_path / "a.csv"), "u", "y").remarks == [data.notes[0]]
+    assert look_at(open_table(tmp_path / "a.csv"), "u", "y").notes == [data.notes[0]]
 
 
 def test_a_clock_among_columns_of_text_is_the_time(tmp_path):
