@@ -97,7 +97,7 @@ def test_the_table_shows_what_the_start_adds_where_it_matters():
     for name, shown in (("short", True), ("long", False)):
         data = lfrtorch.Dataset("d", [train], [], [records[name]]).with_windows()
         start = lfrtorch.initialise(linear, [train], nz=1, nw=1, nn=2)
-        found = scores.scored(Evaluation(dataset=data, linear=linear, model=start))
-        table = scores.table(found, [])
-        assert ("from the start" in table) == shown
+        evaluation = Evaluation(dataset=data, linear=linear, model=start)
+        found = scores.scored(evaluation)
+        assert ("from the start" in scores.table(evaluation)) == shown
         assert found["scores"][name]["start_error"] > 0
