@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
+import torch
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import percent
@@ -18,6 +19,7 @@ from lfrtorch.data.dataset import Dataset
 from lfrtorch.data.metrics import rms
 from lfrtorch.data.records import Record
 from lfrtorch.data.score_window import SHORTEST, warm_up
+from lfrtorch.distributed import agreed
 from lfrtorch.linear.order_scan import scan_orders
 
 _LONGEST = 3000
@@ -99,7 +101,9 @@ def try_starts(record: Record) -> StartTrial:
         ).best
         for start, judge in judges.items()
     }
-    return StartTrial(error("zero"), error("estimated"))
+    # Rounding differs between processes, and the choice must not.
+    errors = torch.tensor([error("zero"), error("estimated")], dtype=torch.float64)
+    return StartTrial(*agreed(errors).tolist())
 
 
 def decided(dataset: Dataset) -> Dataset:
