@@ -1,6 +1,7 @@
 """The first line of what users are told is short."""
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,12 +14,15 @@ PACKAGE = Path(__file__).resolve().parents[1] / "lfrtorch"
 FILLED = "______"
 """Stands for what a message is filled with: a number, a name."""
 
+FIELD = re.compile(r"\{\w[\w.\[\]]*(:[^{}]*)?\}")
+"""What is filled in a sentence of a table."""
+
 
 def text(node: ast.AST) -> str:
     """The longest that an expression may say."""
     match node:
         case ast.Constant(value=str(value)):
-            return value
+            return FIELD.sub(FILLED, value)
         case ast.JoinedStr(values=values):
             return "".join(map(text, values))
         case ast.BinOp(left=left, op=ast.Add(), right=right):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,11 +57,90 @@ _COHERENT, _UNRELATED = 0.1, 0.05
 _DELAY, _SHARP = 5, 0.5  # samples of a dead time worth a shift; its share of the peak's lag
 
 
+_SENTENCES = {
+    "empty": "'{name}' has no values at all; leave it out.",
+    "missing": "'{name}' misses {one.missing} of {one.samples} samples, up to {one.gap} in a row: "
+    "outputs are not fitted there; fill the gaps of inputs, or cut there by gaps='split'.",
+    "mark": "{side}'{name}' is exactly {value:g} in {count} samples, at {places}, far from all "
+    "other values: a mark for a missing value, or a dropout; {remedy}.",
+    "frozen": "{side}'{name}' stays exactly {places}, while the input moves, and changes at each "
+    "sample else around it: check the sensor; {remedy}.",
+    "constant": "{side}'{name}' is constant at {one.mean:.6g}{told}",
+    "still": "no input or output moves in {share:.0f} % of the record (samples {first} to "
+    "{last}): little is learnt there; cut most of it off, or excite the system all the time.",
+    "clipped": "{side}'{name}' has its {what} value {end.value:.6g} in {end.samples} samples "
+    "({share:.2g} %), {end.run} in a row: it is clipped; if by the sensor, use more range, or "
+    "give its limits.",
+    "coarse": "{side}'{name}' has {one.values} values, in steps of {one.step:.3g} ({share:.0f} % "
+    "of its rms): an rms error of about {least:.2g} is the least; use more of the converter's "
+    "range.",
+    "short": "{T} samples{after} are few to fit: a small nonlinear model has 50 to 100 "
+    "parameters; measure longer.",
+    "outliers": "{side}'{name}' has {count} outlier(s), at sample {places}: if misread, {remedy}, "
+    "by Record(valid=...) or an empty cell of the output.",
+    "binary": "input '{name}' has two values only: of a nonlinearity at the input nothing shows "
+    "between them; use a signal of many levels, as a multisine.",
+    "narrow": "input '{name}' excites {band} {unit} only: elsewhere a model is a guess; excite "
+    "the band where it is used.",
+    "lines": "input '{name}' excites {count} frequenc{ending} or so, {band} {unit}: enough for "
+    "order {count}; excite the band where the model is used.",
+    "oversampled": "99 % of all power lies below {highest:.3g} {unit}, fs / {ratio:.0f}: the "
+    "record is oversampled.\nDecimate by {factor} (scipy.signal.decimate) for a faster fit, "
+    "unless modes above {lost:.3g} {unit}, which go with it, matter.",
+    "held": "the inputs change every {hold} samples only, and 99 % of the outputs' power lies "
+    "below {highest:.3g} {unit}:\none sample in {factor}, sample {first} among them, is enough "
+    "for a faster fit, unless modes above {lost:.3g} {unit} matter.",
+    "periods": "the record has {count:.2f} periods of {period} samples{after}: less than two tell "
+    "no noise from distortion; measure more, or cut it to one in steady state.",
+    "same": "inputs '{name[0]}' and '{name[1]}' carry the same signal (correlation "
+    "{correlation:.4f}): what each does cannot be told; leave one out.",
+    "swapped": "output '{output}' comes before input '{input}': are inputs and outputs swapped? "
+    "(Or a controller makes the input from the output.)",
+    "chain": "'{first}' integrates '{second}', which integrates, too: use start='measured', as "
+    "the outputs tell the states, and horizon=N, the samples ahead that count.",
+    "feedback": "input '{name}' reacts to the output: a controller closes the loop, and noise "
+    "biases a fit; try {changes}, or give its reference=r{compare}.",
+    "integrates": "output '{name}' integrates{behind}: use {known}start='estimated'; it has no "
+    "steady state.",
+    "friction": "input '{input}' changes with the direction of '{name}': dry friction or play; "
+    "take nx so large that a state can be the speed.",
+    "unrelated": "hardly anything of output '{name}' follows from the inputs linearly: other "
+    "columns, times that do not fit, noise, or a purely even nonlinearity.",
+    "delay": "a dead time of about {delay} samples{lasting} from input '{input}' to output "
+    "'{output}', after the usual one sample:\nshift the output by it, or a model spends as many "
+    "states on it.",
+    "drift": "output '{name}' drifts by {drift:.3g} in the record, {ratio:.1f} times its rms, and "
+    "no input does: take it off if the sensor drifts; leave it if the system integrates.",
+    "lost": "from about sample {sample} on, '{name}' follows the inputs one sample {turn}:\na "
+    "sample of the {side} may be lost, or clocks differ; if so, cut the record there.",
+    "gain": "from about sample {sample} on, the gain from the inputs to '{name}' is {ratio:.2g} "
+    "times that before, at inputs of the same level:\na setting or the system may have changed; "
+    "if so, cut the record there, or give what changed as an input.",
+}
+"""What may be wrong, by its kind, and what to do."""
+
+_CONSTANT = {
+    "alone": ": it tells nothing.",
+    "output": ": it does not respond; check the sensor and the column.",
+    "step": " and the output moves: if it steps at the first sample, put samples from before the "
+    "step in front; if another input moves the output, name that one.",
+    "input": ": it tells nothing, unless it differs in other records; leave it out of the inputs "
+    "if it does not.",
+}
+"""What a constant signal means, by its use."""
+
+
 class Note(NamedTuple):
     """A sentence, and its kind, which is the same in all records."""
 
     kind: str
     text: str
+
+    @classmethod
+    def of(cls, row: str, name: Any = "", *, kind: str = "", **values: Any) -> Note:
+        """The sentence of a row on what has this name; ``kind`` if it is not both."""
+        sentence = _SENTENCES[row].format(name=name, **values)
+        return cls(kind or f"{row} {name}".rstrip(), sentence)
 
 
 def examine(
@@ -134,15 +213,17 @@ def notes_on(
 def _missing(found: Survey) -> Iterator[Note]:
     """Samples without a value."""
     for one in found.signals:
-        name, T = one.channel.name, one.samples
-        if one.missing == T:
-            yield Note(f"missing {name}", f"'{name}' has no values at all; leave it out.")
-        elif one.missing:
-            yield Note(
-                f"missing {name}",
-                f"'{name}' misses {one.missing} of {T} samples, up to {one.gap} in a row: outputs "
-                "are not fitted there; fill the gaps of inputs, or cut there by gaps='split'.",
-            )
+        if one.missing:
+            row = "empty" if one.missing == one.samples else "missing"
+            name = one.channel.name
+            yield Note.of(row, name, kind=f"missing {name}", one=one)
+
+
+def _sides(found: Survey) -> list[str]:
+    """The use of each signal before its name, if it is known."""
+    if not found.inputs:
+        return [""] * len(found.outputs)
+    return ["input "] * len(found.inputs) + ["output "] * len(found.outputs)
 
 
 def _faults(found: Survey, u: Array, y: Array, skipped: int) -> tuple[list[Note], Array, Array]:
@@ -150,21 +231,16 @@ def _faults(found: Survey, u: Array, y: Array, skipped: int) -> tuple[list[Note]
     notes = list[Note]()
     u, y = u.copy(), y.copy()
     nu = u.shape[1]
-    for i, (one, signal) in enumerate(zip(found.signals, (*u.T, *y.T), strict=True)):
+    signals = zip(found.signals, _sides(found), (*u.T, *y.T), strict=True)
+    for i, (one, side, signal) in enumerate(signals):
         name, of_input = one.channel.name, i < nu
-        kind = ("input " if of_input else "output ") if nu else ""
         remedy = "fill these cells" if of_input else "empty these cells, or Record(valid=...)"
+        told = {"side": side, "remedy": remedy}
         marks = marked(signal, of_input=of_input)
         for value in np.unique(signal[marks]):
             k = np.flatnonzero(signal == value)
-            notes.append(
-                Note(
-                    f"mark {name} {value:g}",
-                    f"{kind}'{name}' is exactly {value:g} in {len(k)} samples, at "
-                    f"{_numbered(k, skipped)}, far from all other values: a mark for a missing "
-                    f"value, or a dropout; {remedy}.",
-                )
-            )
+            told |= {"value": value, "count": len(k), "places": _numbered(k, skipped)}
+            notes.append(Note.of("mark", name, kind=f"mark {name} {value:g}", **told))
         known = np.flatnonzero(np.isfinite(signal) & ~marks)
         if marks.any():
             signal[marks] = np.interp(np.flatnonzero(marks), known, signal[known])
@@ -175,13 +251,7 @@ def _faults(found: Survey, u: Array, y: Array, skipped: int) -> tuple[list[Note]
                 f"{skipped + part.stop - 1}"
                 for part in parts
             )
-            notes.append(
-                Note(
-                    f"frozen {name}",
-                    f"{kind}'{name}' stays exactly {shown}, while the input moves, and changes "
-                    f"at each sample else around it: check the sensor; {remedy}.",
-                )
-            )
+            notes.append(Note.of("frozen", name, side=side, places=shown, remedy=remedy))
         for part in parts:
             signal[part] = np.nan
     return notes, u, y
@@ -191,78 +261,45 @@ def _levels(
     found: Survey, u: Array, y: Array, skipped: int, moving: Sequence[bool]
 ) -> Iterator[Note]:
     """Constant, clipped and coarse signals, a rest, a short record."""
-    roles, T = bool(found.inputs), len(y)
+    T, sides = len(y), _sides(found)
     alone = not any(one.rms > 0 for one in found.inputs)
+    steps = alone and any(output.rms > 0 for output in found.outputs)
     elsewhere = [*moving, *[False] * len(found.signals)]
-    for one, moves in zip(found.signals, elsewhere, strict=False):
-        if one.values != 1 or moves:
-            continue
-        told = f"'{one.channel.name}' is constant at {one.mean:.6g}"
-        if not roles:
-            text = f"{told}: it tells nothing."
-        elif one not in found.inputs:
-            text = f"output {told}: it does not respond; check the sensor and the column."
-        elif alone and any(output.rms > 0 for output in found.outputs):
-            text = (
-                f"input {told} and the output moves: if it steps at the first sample, put samples "
-                "from before the step in front; if another input moves the output, name that one."
-            )
-        else:
-            text = (
-                f"input {told}: it tells nothing, unless it differs in other records; "
-                "leave it out of the inputs if it does not."
-            )
-        yield Note(f"constant {one.channel.name}", text)
+    for one, side, moves in zip(found.signals, sides, elsewhere, strict=False):
+        if one.values == 1 and not moves:
+            use = side.rstrip() or "alone"
+            told = _CONSTANT["step" if use == "input" and steps else use]
+            yield Note.of("constant", one.channel.name, one=one, side=side, told=told)
     first, length = _still(found, u, y)
     if length >= _STILL * max(T, _ENOUGH):
-        yield Note(
-            "still",
-            f"no input or output moves in {100 * length / T:.0f} % of the record (samples "
-            f"{skipped + first} to {skipped + first + length}): little is learnt there; cut most "
-            "of it off, or excite the system all the time.",
-        )
+        first += skipped
+        yield Note.of("still", share=100 * length / T, first=first, last=first + length)
+    side = sides[-1]
     for one in found.outputs:
-        name, kind = one.channel.name, "output " if roles else ""
+        name = one.channel.name
         for end in one.clipped:
             what = "largest" if end is one.maximum else "smallest"
-            yield Note(
-                f"clipped {name} {what}",
-                f"{kind}'{name}' has its {what} value {end.value:.6g} in {end.samples} samples "
-                f"({100 * end.samples / T:.2g} %), {end.run} in a row: it is clipped; if by the "
-                "sensor, use more range, or give its limits.",
-            )
+            share = 100 * end.samples / T
+            told = {"end": end, "what": what, "side": side, "share": share}
+            yield Note.of("clipped", name, kind=f"clipped {name} {what}", **told)
         if T > _FEW and one.values > 2 and one.step > _COARSE * one.rms:
-            yield Note(
-                f"coarse {name}",
-                f"{kind}'{name}' has {one.values} values, in steps of {one.step:.3g} "
-                f"({100 * one.step / one.rms:.0f} % of its rms): an rms error of about "
-                f"{one.step / np.sqrt(12):.2g} is the least; use more of the converter's range.",
-            )
+            share, least = 100 * one.step / one.rms, one.step / np.sqrt(12)
+            yield Note.of("coarse", name, one=one, side=side, share=share, least=least)
     if T < _SHORT:
-        yield Note(
-            "short",
-            f"{T} samples{_after(skipped)} are few to fit: a small nonlinear model has 50 to 100 "
-            "parameters; measure longer.",
-        )
+        yield Note.of("short", T=T, after=_after(skipped))
 
 
 def _outliers(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
     """Lone samples that stick out of a signal."""
     places = [input_outliers(signal, y) for signal in u.T]
     places += [output_outliers(s, u) if found.inputs else input_outliers(s) for s in y.T]
-    for i, (one, k) in enumerate(zip(found.signals, places, strict=True)):
-        if not len(k):
-            continue
-        kind = ("input " if i < u.shape[1] else "output ") if found.inputs else ""
-        remedy = "leave them out"
-        if kind == "input ":
-            remedy = "interpolate, or leave the outputs that follow out"
-        yield Note(
-            f"outliers {one.channel.name}",
-            f"{kind}'{one.channel.name}' has {len(k)} outlier(s), at sample "
-            f"{_numbered(k, skipped)}: if misread, {remedy}, by "
-            "Record(valid=...) or an empty cell of the output.",
-        )
+    remedies = {"input ": "interpolate, or leave the outputs that follow out"}
+    for one, side, k in zip(found.signals, _sides(found), places, strict=True):
+        if len(k):
+            remedy, shown = remedies.get(side, "leave them out"), _numbered(k, skipped)
+            yield Note.of(
+                "outliers", one.channel.name, side=side, count=len(k), places=shown, remedy=remedy
+            )
 
 
 def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
@@ -273,35 +310,20 @@ def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
             continue
         name, (low, high) = one.channel.name, one.band
         if one.values == 2:
-            yield Note(
-                f"binary {name}",
-                f"input '{name}' has two values only: of a nonlinearity at the input nothing shows "
-                "between them; use a signal of many levels, as a multisine.",
-            )
-        count = _frequencies(signal)
+            yield Note.of("binary", name)
+        count, shown = _frequencies(signal), f"{low:.4g} to {high:.4g}"
         if count < _FEW_FREQUENCIES:
-            yield Note(
-                f"narrow {name}",
-                f"input '{name}' excites {count} frequenc{'y' if count == 1 else 'ies'} or so, "
-                f"{low:.4g} to {high:.4g} {unit}: enough for order {count}; "
-                "excite the band where the model is used.",
-            )
+            told = {"count": count, "ending": "y" if count == 1 else "ies"}
+            told |= {"band": shown, "unit": unit}
+            yield Note.of("lines", name, kind=f"narrow {name}", **told)
         elif high - low < _NARROW * (high + low) / 2:
-            yield Note(
-                f"narrow {name}",
-                f"input '{name}' excites {low:.4g} to {high:.4g} {unit} only: elsewhere a model is "
-                "a guess; excite the band where it is used.",
-            )
+            yield Note.of("narrow", name, band=shown, unit=unit)
     bands = [one.band for one in found.signals]
     if bands and all(b is not None and b[1] < fs / _OVERSAMPLED for b in bands):
         highest = max(b[1] for b in bands if b is not None)
         factor = int(fs / (_WANTED * highest)) if highest > 0 else 1
-        yield Note(
-            "oversampled",
-            f"99 % of all power lies below {highest:.3g} {unit}, fs / {fs / highest:.0f}: the "
-            f"record is oversampled.\nDecimate by {factor} (scipy.signal.decimate) for a faster "
-            f"fit, unless modes above {fs / (2 * factor):.3g} {unit}, which go with it, matter.",
-        )
+        told = {"highest": highest, "unit": unit, "factor": factor, "lost": fs / (2 * factor)}
+        yield Note.of("oversampled", ratio=fs / highest, **told)
     elif found.outputs and (clock := held(u)) is not None:
         hold, first = clock[0], skipped + found.whole.start + clock[1]
         highest = max(fs if one.band is None else one.band[1] for one in found.outputs)
@@ -309,39 +331,26 @@ def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
             k for k in range(1, hold + 1) if not hold % k and k <= max(1, fs / (_WANTED * highest))
         )
         if factor > 1 and highest < min(fs / _OVERSAMPLED, fs / (2 * hold)):
-            yield Note(
-                "held",
-                f"the inputs change every {hold} samples only, and 99 % of the outputs' power lies "
-                f"below {highest:.3g} {unit}:\none sample in {factor}, sample {first} "
-                "among them, is enough for a faster fit, unless modes above "
-                f"{fs / (2 * factor):.3g} {unit} matter.",
-            )
+            told = {"highest": highest, "unit": unit, "factor": factor, "lost": fs / (2 * factor)}
+            yield Note.of("held", hold=hold, first=first, **told)
     period = found.inputs[0].period if found.inputs else None
     if period is not None and period < T < 2 * period:
-        yield Note(
-            "periods",
-            f"the record has {T / period:.2f} periods of {period} samples{_after(skipped)}: less "
-            "than two tell no noise from distortion; measure more, or cut it to one in steady "
-            "state.",
-        )
-    for i in range(u.shape[1]):
-        for j in range(i):
-            if bands[i] is None or bands[j] is None:
-                continue
-            correlation = float(np.corrcoef(u[:, i], u[:, j])[0, 1])
-            if abs(correlation) > _SAME:
-                names = found.inputs[j].channel.name, found.inputs[i].channel.name
-                yield Note(
-                    f"same {names}",
-                    f"inputs '{names[0]}' and '{names[1]}' carry the same signal (correlation "
-                    f"{correlation:.4f}): what each does cannot be told; leave one out.",
-                )
+        yield Note.of("periods", count=T / period, period=period, after=_after(skipped))
+    for j, i in combinations(range(u.shape[1]), 2):
+        if bands[i] is None or bands[j] is None:
+            continue
+        correlation = float(np.corrcoef(u[:, i], u[:, j])[0, 1])
+        if abs(correlation) > _SAME:
+            names = found.inputs[j].channel.name, found.inputs[i].channel.name
+            yield Note.of("same", names, correlation=correlation)
 
 
 def _relations(
     found: Survey, u: Array, y: Array, skipped: int, given: Mapping[str, Any]
 ) -> Iterator[Note]:
     """How outputs (T, ny) without gaps follow inputs (T, nu): order, delay, drift, changes."""
+    inputs = [one.channel.name for one in found.inputs]
+    outputs = [one.channel.name for one in found.outputs]
     between = {
         (i, j): pair
         for i in range(y.shape[1])
@@ -351,12 +360,7 @@ def _relations(
     if between:
         (i, j), pair = max(between.items(), key=lambda item: item[1].coherence)
         if _first(pair):
-            names = found.outputs[i].channel.name, found.inputs[j].channel.name
-            yield Note(
-                "swapped",
-                f"output '{names[0]}' comes before input '{names[1]}': are inputs and outputs "
-                "swapped? (Or a controller makes the input from the output.)",
-            )
+            yield Note.of("swapped", output=outputs[i], input=inputs[j])
             return
     rate = rates(y)
     counts = [
@@ -366,16 +370,10 @@ def _relations(
     # Two integrators are behind all outputs or none.
     some = counts if min(counts) else [min(count, 1) for count in counts]
     asked = counts[0] if len({*counts}) == 1 else f"[{','.join(map(str, some))}]"
-    names = [output.channel.name for output in found.outputs]
     both = ((i, j) for i, j in enumerate(rate) if j is not None and counts[i] and counts[j])
     linked = next(both, chain(rate))
     if linked is not None:
-        first, second = (names[i] for i in linked)
-        yield Note(
-            "chain",
-            f"'{first}' integrates '{second}', which integrates, too: use start='measured', as the "
-            "outputs tell the states, and horizon=N, the samples ahead that count.",
-        )
+        yield Note.of("chain", first=outputs[linked[0]], second=outputs[linked[1]])
     changes, compare = ["feedthrough=False"] if given.get("feedthrough", True) else [], ""
     if given.get("refine") != "prediction" and not any(counts):
         changes.append("refine='prediction' or noise='innovation'")
@@ -384,57 +382,32 @@ def _relations(
     parts = reacting(u, y, feedthrough=bool(given.get("feedthrough", True)))
     for one, part in zip(moving, parts, strict=True):
         if part and changes and not _repeats(one):
-            yield Note(
-                f"feedback {one.channel.name}",
-                f"input '{one.channel.name}' reacts to the output: a controller closes the loop, "
-                f"and noise biases a fit; try {' and '.join(changes)}, or give its reference=r"
-                f"{compare}.",
-            )
+            told = " and ".join(changes)
+            yield Note.of("feedback", one.channel.name, changes=told, compare=compare)
     for i, output in enumerate(found.outputs):
         pairs = {j: pair for (k, j), pair in between.items() if k == i}
         name, integrates = output.channel.name, counts[i]
         if integrates and linked is None:
             known = "" if np.any(given.get("integrators", 0)) else f"integrators={asked} and "
             j = rate[i]
-            kind, behind = ("integrates", "") if j is None else ("rate", f" output '{names[j]}'")
-            yield Note(
-                f"{kind} {name}",
-                f"output '{name}' integrates{behind}: use {known}start='estimated'; "
-                "it has no steady state.",
-            )
+            kind, behind = ("integrates", "") if j is None else ("rate", f" output '{outputs[j]}'")
+            told = {"known": known, "behind": behind}
+            yield Note.of("integrates", name, kind=f"{kind} {name}", **told)
         force = next((j for j in range(u.shape[1]) if rubs(u[:, j], y[:, i])), None)
         if force is not None:
-            yield Note(
-                f"friction {name}",
-                f"input '{found.inputs[force].channel.name}' changes with the direction of "
-                f"'{name}': dry friction or play; take nx so large that a state can be the speed.",
-            )
-        if (
-            not integrates
-            and pairs
-            and sum(p.coherence - p.chance for p in pairs.values()) < _UNRELATED
-        ):
-            yield Note(
-                f"unrelated {name}",
-                f"hardly anything of output '{name}' follows from the inputs linearly: "
-                "other columns, times that do not fit, noise, or a purely even nonlinearity.",
-            )
+            yield Note.of("friction", name, input=inputs[force])
+        beyond = sum(p.coherence - p.chance for p in pairs.values())
+        if not integrates and pairs and beyond < _UNRELATED:
+            yield Note.of("unrelated", name)
         for j, pair in pairs.items():
-            if (
-                pair.coherence - pair.chance < _COHERENT
-                or pair.causality < _AFTER
-                or pair.peak < _DELAY
-            ):
+            unclear = pair.coherence - pair.chance < _COHERENT or pair.causality < _AFTER
+            if unclear or pair.peak < _DELAY:
                 continue
             delay = dead_time(u[:, j], y[:, i], pair.peak)
             if max(_DELAY, _SHARP * pair.peak) <= delay <= pair.peak:
                 lasting = "" if found.fs is None else f" ({delay / found.fs:.3g} s)"
-                yield Note(
-                    f"delay {name} {j}",
-                    f"a dead time of about {delay} samples{lasting} from input "
-                    f"'{found.inputs[j].channel.name}' to output '{name}', after the usual one "
-                    "sample:\nshift the output by it, or a model spends as many states on it.",
-                )
+                told = {"input": inputs[j], "output": name, "lasting": lasting}
+                yield Note.of("delay", f"{name} {j}", delay=delay, **told)
         if not integrates:
             yield from _drift(output, y[:, i], u)
             yield from _change(output, y[:, i], u, skipped)
@@ -463,12 +436,8 @@ def _drift(output: SignalSurvey, y: Array, u: Array) -> Iterator[Note]:
     centred = u - u.mean(axis=0)
     others = [_trend(v)[0] for v in (*centred.T, *np.abs(centred).T)]
     if share > _DRIFT and steady and max(others, default=1.0) < _OTHERS:
-        yield Note(
-            f"drift {output.channel.name}",
-            f"output '{output.channel.name}' drifts by {slope * len(y):.3g} in the record, "
-            f"{abs(slope) * len(y) / output.rms:.1f} times its rms, and no input does: take it "
-            "off if the sensor drifts; leave it if the system integrates.",
-        )
+        drift, ratio = slope * len(y), abs(slope) * len(y) / output.rms
+        yield Note.of("drift", output.channel.name, drift=drift, ratio=ratio)
 
 
 def _change(output: SignalSurvey, y: Array, u: Array, skipped: int) -> Iterator[Note]:
@@ -476,21 +445,12 @@ def _change(output: SignalSurvey, y: Array, u: Array, skipped: int) -> Iterator[
     found, name = change(u, y), output.channel.name
     if found is None:
         return
-    at = f"about sample {skipped + found.sample}"
+    sample = skipped + found.sample
     if found.shift:
         turn, side = ("sooner", "output") if found.shift > 0 else ("later", "inputs")
-        yield Note(
-            f"lost {name}",
-            f"from {at} on, '{name}' follows the inputs one sample {turn}:\na sample of the {side} "
-            "may be lost, or clocks differ; if so, cut the record there.",
-        )
+        yield Note.of("lost", name, sample=sample, turn=turn, side=side)
     else:
-        yield Note(
-            f"gain {name}",
-            f"from {at} on, the gain from the inputs to '{name}' is {found.ratio:.2g} times that "
-            "before, at inputs of the same level:\na setting or the system may have changed; if "
-            "so, cut the record there, or give what changed as an input.",
-        )
+        yield Note.of("gain", name, sample=sample, ratio=found.ratio)
 
 
 def _trend(signal: Array) -> tuple[float, float]:
