@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from lfrtorch._support.tables import quantity
-from lfrtorch.analysis.amplitude_margin import LOUDER
+from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.analysis.physical_parameters import PhysicalParameters
 from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.data.dataset import Dataset
@@ -21,7 +21,7 @@ from lfrtorch.linear.order_scan import OrderScan
 from lfrtorch.model.model import Model
 from lfrtorch.reporting import scores
 from lfrtorch.reporting.advice import Advice
-from lfrtorch.reporting.evaluation import Evaluation, Response
+from lfrtorch.reporting.evaluation import Evaluation, Response, finite
 from lfrtorch.reporting.verdict import Verdict
 
 
@@ -67,9 +67,12 @@ class Run:
     residuals: Residuals | None = None
     parameters: PhysicalParameters | None = None
     memory: Memory | None = None
-    metrics: Mapping[str, Any]
+    metrics: Mapping[str, Any] = field(init=False)
     verdict: Verdict
     advice: list[Advice]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "metrics", self._metrics())
 
     @property
     def model(self) -> Model:
@@ -111,3 +114,42 @@ class Run:
         if self.memory is not None and not self.memory.fades:
             parts.append(f"note: {self.memory}")
         return "\n".join(parts)
+
+    def _metrics(self) -> dict[str, Any]:
+        # A model fitted again is scored on the tests; validation errors are those before it.
+        fit, refit, dataset = self.fit, self.refit, self.dataset
+        entries = scores.scored(self.evaluation)
+        entries["data"] |= {
+            "samples": sum(record.samples for record in dataset.train),
+            "seed": dataset.seed,
+        }
+        entries |= {
+            "verdict": asdict(self.verdict),
+            "used": self.settings.used,
+            "sizes_search": [] if self.choice is None else self.choice.entries(),
+            "fit": {
+                "iterations": fit.iterations,
+                "seconds": fit.seconds,
+                "seconds_per_iteration": fit.seconds_per_iteration,
+                "reason": fit.outcome,
+            },
+            "chosen_iteration": fit.chosen_iteration,
+            "refit": refit
+            and {
+                "iterations": refit.iterations,
+                "seconds": refit.seconds,
+                "reason": refit.outcome,
+                "train_before": refit.history[0].train,
+                "train": refit.history[refit.chosen_iteration].train,
+            },
+            "known": {} if self.parameters is None else self.parameters.entries(),
+            "residuals": {} if self.residuals is None else self.residuals.entries(),
+            "stable_to": largest_stable_amplitude(self.model, dataset.train),
+            "memory": self.memory and self.memory._asdict(),
+            "starts": max(1, len(fit.starts)),
+            "averaged": fit.averaged,
+            "ranking": [
+                {"seed": self.settings.seeds[start.number], **asdict(start)} for start in fit.starts
+            ],
+        }
+        return finite(entries)

@@ -30,7 +30,6 @@ from lfrtorch.reporting.evaluation import (
 )
 from lfrtorch.reporting.opponent import Opponents, opponents
 from lfrtorch.reporting.run import Run
-from lfrtorch.reporting.scores import metrics
 from lfrtorch.reporting.verdict import REMEMBERS, judge, judge_predictions
 
 
@@ -94,17 +93,6 @@ def scored_run(job: Job) -> Run:
         if begins_at_outputs(of) and settings.horizon is not None:
             of = windows(of, settings.horizon, model.lfr.cell.nx, y_scale=model.scaler.y_scale)
         known = physical_parameters((again or result).model, of, ridge=ridge)
-    numbers = metrics(
-        result,
-        evaluation,
-        settings=settings,
-        choice=choice,
-        verdict=verdict,
-        refit=again,
-        residuals=residuals,
-        parameters=known,
-        memory=memory,
-    )
     return Run(
         dataset=dataset,
         settings=settings,
@@ -117,7 +105,6 @@ def scored_run(job: Job) -> Run:
         residuals=residuals,
         parameters=known,
         memory=memory,
-        metrics=numbers,
         verdict=verdict,
         advice=advise(found),
     )

@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
 
 from lfrtorch._support import tables
 from lfrtorch._support.reasons import Reason
-from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
-from lfrtorch.analysis.physical_parameters import PhysicalParameters
-from lfrtorch.analysis.residual_analysis import Residuals
+from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.data.dataset import LISTED
 from lfrtorch.data.records import common_unit
-from lfrtorch.fitting.choice import Choice
-from lfrtorch.fitting.forgetting import Memory
-from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.reporting.evaluation import HORIZONS, Evaluation, finite
 from lfrtorch.reporting.score_columns import ALL, columns, in_units, named_rows, rows_of
-from lfrtorch.reporting.verdict import Verdict
 
 ERRORS = "rmse", "lti_rmse"
 """Entries of a score in the unit of the outputs: of the NL-LFR and of the linear model."""
@@ -32,61 +25,8 @@ ESTIMATION = "validation", "selection"
 _MOST_ROWS = 24  # of outputs on the terminal; the report has all
 
 
-def metrics(
-    result: FitResult,
-    evaluation: Evaluation,
-    *,
-    settings: Settings,
-    choice: Choice | None = None,
-    verdict: Verdict | None = None,
-    refit: FitResult | None = None,
-    residuals: Residuals | None = None,
-    parameters: PhysicalParameters | None = None,
-    memory: Memory | None = None,
-) -> dict[str, Any]:
-    """What ``metrics.json`` holds of a fit, but for its origin; None for what is not finite."""
-    # A model fitted again is scored on the tests; validation errors are those before it.
-    model, dataset = (refit or result).model, evaluation.dataset
-    entries = scored(evaluation)
-    entries["data"] |= {
-        "samples": sum(record.samples for record in dataset.train),
-        "seed": dataset.seed,
-    }
-    entries |= {
-        "verdict": None if verdict is None else asdict(verdict),
-        "used": settings.used,
-        "sizes_search": [] if choice is None else choice.entries(),
-        "fit": {
-            "iterations": result.iterations,
-            "seconds": result.seconds,
-            "seconds_per_iteration": result.seconds_per_iteration,
-            "reason": result.outcome,
-        },
-        "chosen_iteration": result.chosen_iteration,
-        "refit": None
-        if refit is None
-        else {
-            "iterations": refit.iterations,
-            "seconds": refit.seconds,
-            "reason": refit.outcome,
-            "train_before": refit.history[0].train,
-            "train": refit.history[refit.chosen_iteration].train,
-        },
-        "known": {} if parameters is None else parameters.entries(),
-        "residuals": {} if residuals is None else residuals.entries(),
-        "stable_to": largest_stable_amplitude(model, dataset.train),
-        "memory": None if memory is None else memory._asdict(),
-        "starts": max(1, len(result.starts)),
-        "averaged": result.averaged,
-        "ranking": [
-            {"seed": settings.seeds[start.number], **asdict(start)} for start in result.starts
-        ],
-    }
-    return finite(entries)
-
-
 def scored(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
-    """Scores of a model, and of a linear one if there is one: ``metrics`` without a fit."""
+    """Scores of a model, and of a linear one if there is one: ``metrics.json`` without a fit."""
     dataset, bla = evaluation.dataset, evaluation.linear
     model = evaluation.refitted or evaluation.model
     assert model is not None

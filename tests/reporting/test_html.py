@@ -77,9 +77,6 @@ class Run:
         return self.evaluation.simulations
 
     def page(self, advice: tuple[Advice, ...] = (), search=(), residuals=None, config="") -> Page:
-        metrics = report.metrics(
-            self.result, self.evaluation, settings=lfrtorch.Settings(nx=2, starts=2)
-        )
         found = lfrtorch.Run(
             dataset=self.dataset,
             settings=lfrtorch.Settings(nx=2, starts=2),
@@ -89,10 +86,10 @@ class Run:
             fit=self.result,
             evaluation=self.evaluation,
             residuals=residuals,
-            metrics=metrics | {"sizes_search": search},
             verdict=judge(self.result, self.responses, linear_nx=self.bla.nx),
             advice=list(advice),
         )
+        vars(found)["metrics"] = {**found.metrics, "sizes_search": search}
         images = {"convergence": b"PNG 1", "near": b"PNG 2"}
         views = {record.name: {"near": "a close-up"} for record in self.dataset.tests}
         options = {"views": views, "command": "train.py a=1", "config": config}

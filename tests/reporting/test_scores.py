@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from lfrtorch.data.records import Channel, Record
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.evaluation import Evaluation, Response, of_samples
 from lfrtorch.reporting.score_columns import use_of
+from lfrtorch.reporting.verdict import Kind, Verdict
 
 pytestmark = pytest.mark.numeric
 
@@ -50,6 +52,7 @@ def result() -> tuple[lfrtorch.FitResult, lfrtorch.LinearModel, Dataset]:
 
 
 SEEDS = [7, 1007, 2007]
+SETTINGS = lfrtorch.Settings(nx=2)
 
 
 def evaluated(
@@ -58,16 +61,32 @@ def evaluated(
     return Evaluation(dataset=data, linear=bla, model=fitted.model, **own)
 
 
+def metrics_of(
+    fitted: lfrtorch.FitResult,
+    evaluation: Evaluation,
+    settings: lfrtorch.Settings = SETTINGS,
+) -> Mapping[str, Any]:
+    assert evaluation.linear is not None
+    return lfrtorch.Run(
+        dataset=evaluation.dataset,
+        settings=settings,
+        linear=evaluation.linear,
+        order_scan=None,
+        choice=None,
+        fit=fitted,
+        evaluation=evaluation,
+        verdict=Verdict(Kind.UNJUDGED, "", "NL-LFR"),
+        advice=[],
+    ).metrics
+
+
 def test_starts_are_ranked_in_files_and_in_a_table(result):
     _, bla, data = result
     models = [lfrtorch.initialise(bla, data.train, nz=1, nw=1, nn=3, seed=seed) for seed in SEEDS]
     trainer = lfrtorch.LevenbergMarquardt(max_iter=4)
     fitted = lfrtorch.fit(models, data.train, data.validation, trainer=trainer)
-    metrics = report.metrics(
-        fitted,
-        evaluated(fitted, bla, data),
-        settings=lfrtorch.Settings(nx=2, starts=3, seed=SEEDS[0]),
-    )
+    settings = lfrtorch.Settings(nx=2, starts=3, seed=SEEDS[0])
+    metrics = metrics_of(fitted, evaluated(fitted, bla, data), settings)
     assert json.loads(json.dumps(metrics, allow_nan=False)) == metrics
     assert metrics["starts"] == 3
     assert sorted(start["seed"] for start in metrics["ranking"]) == SEEDS
@@ -86,7 +105,7 @@ def test_a_test_may_have_a_linear_model_of_its_own(result):
     data = replace(data, linear={"test": ("train",)})
     own = lfrtorch.estimate_bla(data.train, nx=1)
     evaluation = evaluated(fitted, bla, data, own={"test": own})
-    metrics = report.metrics(fitted, evaluation, settings=lfrtorch.Settings(nx=2))
+    metrics = metrics_of(fitted, evaluation)
     expected = lfrtorch.rmse(data.tests[0], own.simulate(data.tests[0]))
     assert metrics["scores"]["test"]["lti_rmse"] == expected
     assert metrics["linear"] == {"test": ["train"]}
@@ -96,7 +115,7 @@ def test_a_test_may_have_a_linear_model_of_its_own(result):
 
 def test_metrics_are_what_the_model_scores(result):
     fitted, bla, data = result
-    metrics = report.metrics(fitted, evaluated(fitted, bla, data), settings=lfrtorch.Settings(nx=2))
+    metrics = metrics_of(fitted, evaluated(fitted, bla, data))
     test, validation = data.tests[0], data.validation[0]
     y_hat = fitted.model.simulate(test)
     assert metrics["scores"]["test"] == {
@@ -138,7 +157,7 @@ def test_pooled_validation_weighs_samples():
 def test_table_shows_published_results_of_these_sizes_only(result):
     fitted, bla, data = result
     evaluation = evaluated(fitted, bla, data)
-    metrics = report.metrics(fitted, evaluation, settings=lfrtorch.Settings(nx=2))
+    metrics = metrics_of(fitted, evaluation)
     lines = report.table(evaluation).splitlines()
     assert lines[0] == "Simulation RMSE (mV), nx 2, nz 1, nw 1, 3 neurons"
     head, row = lines[2].split(), lines[4].split()
