@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from lfrtorch._support.types import Array
-from lfrtorch.export.equations import check_name, equations, observer_equations
+from lfrtorch.export.equations import equations, observer_equations
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.maps.formula_code import PYTHON, statements, with_slopes
+from lfrtorch.maps.formula_code import PYTHON, with_slopes
 from lfrtorch.maps.operations import Formula
 from lfrtorch.model.extended_kalman_filter import NoiseCovariance
 from lfrtorch.model.model import Model
@@ -61,12 +61,11 @@ def c_source(
         >>> [line for line in source.splitlines() if line.startswith("#include")]
         ['#include "actuator.h"', '#include <math.h>']
     """
-    check_name(name)
-    e = equations(model)
-    known: dict[str, Any] = {"ts": repr(1.0 / e.fs), "about": _comment(e.about(name))}
-    known |= {"constant": _constant, "pairs": _pairs, "operations": _operations}
+    e = equations(model, name)
+    known: dict[str, Any] = {"ts": repr(1.0 / e.fs), "about": _comment(e.about())}
+    known |= {"constant": _constant, "pairs": _pairs, "slopes": _slopes}
     known["roots"] = observer_equations(model, observer).roots
-    header, source = (e.rendered(file, name, **known) for file in ("model.h", "model.c"))
+    header, source = (e.rendered(file, _C, **known) for file in ("model.h", "model.c"))
     return (_single(header), _single(source)) if single else (header, source)
 
 
@@ -81,16 +80,10 @@ _C = {
 """Operations of formulas in C; what is true is 1.0."""
 
 
-def _operations(f: Formula) -> dict[str, list[tuple[str, str]]]:
-    """Assignments of the map and of its Jacobian."""
-    both, nw = with_slopes(f), len(f.results)
-    slopes = both._replace(results=both.results[nw:]).pruned()
-    found = {}
-    for name, to, formula in (("map", "w", f), ("jacobian", "J", slopes)):
-        made, results = statements(formula, [f"z[{i}]" for i in range(f.inputs)], _C)
-        lines = [(f"const double {t}", expression) for t, expression in made]
-        found[name] = lines + [(f"{to}[{i}]", result) for i, result in enumerate(results)]
-    return found
+def _slopes(f: Formula) -> Formula:
+    """The derivatives of the results alone, row by row."""
+    both = with_slopes(f)
+    return both._replace(results=both.results[len(f.results) :]).pruned()
 
 
 def _single(text: str) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
-from lfrtorch.export.equations import check_name, equations, observer_equations
+from lfrtorch.export.equations import equations, observer_equations
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.operations import Formula
 from lfrtorch.model.extended_kalman_filter import NoiseCovariance
@@ -46,8 +46,7 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
         True
     """
     ca = imported("casadi", "casadi")
-    check_name(name)
-    e = equations(model)
+    e = equations(model, name)
     x = ca.SX.sym("x", e.sizes["nx"])
     u = ca.vertcat(*(ca.SX.sym(channel.name) for channel in e.inputs))
     made = e.sample(_Expressions(ca, e.arrays), x, u)
@@ -73,8 +72,7 @@ def casadi_reach(model: Model, name: str = "model") -> Any:
         True
     """
     ca = imported("casadi", "casadi")
-    check_name(name)
-    e = equations(model)
+    e = equations(model, name)
     if e.distance is None:
         raise InputError(
             "the reach of the data is not known; give model.reaching(records), of an NL-LFR."

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from lfrtorch._support.optional import imported
-from lfrtorch.export.equations import check_name, equations
+from lfrtorch.export.equations import equations
 from lfrtorch.linear.control import control_labels
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.maps.formula_code import PYTHON, statements
-from lfrtorch.maps.operations import Formula
+from lfrtorch.maps.formula_code import PYTHON
 from lfrtorch.model.model import Model
 
 _NUMPY = {
@@ -71,14 +70,7 @@ def python_source(model: Model | LinearModel, name: str = "model") -> str:
         >>> np.allclose(y, model.simulate([1.0])[0])
         True
     """
-    check_name(name)
-    e = equations(model)
-    sides = {"inputs": e.inputs, "outputs": e.outputs}
-    labels = {side: control_labels(channels) for side, channels in sides.items()}
-    known = {"about": e.about(name), "fs": float(e.fs), "labels": labels}
-    return e.rendered("model_py.txt", name, **known, **sides, statements=_statements, repr=repr)
-
-
-def _statements(formula: Formula, name: str) -> tuple[list[tuple[str, str]], list[str]]:
-    """Assignments of a formula of inputs called so, and its results."""
-    return statements(formula, [name.format(i) for i in range(formula.inputs)], _NUMPY)
+    e = equations(model, name)
+    labels = {side: control_labels(getattr(e, side)) for side in ("inputs", "outputs")}
+    known = {"about": e.about(), "fs": float(e.fs), "labels": labels}
+    return e.rendered("model_py.txt", _NUMPY, **known, repr=repr)

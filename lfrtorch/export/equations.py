@@ -20,6 +20,8 @@ from lfrtorch.data.records import Channel
 from lfrtorch.engine.cell import Matrices
 from lfrtorch.engine.operating_point import double, equilibrium
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.maps.formula_code import statements
+from lfrtorch.maps.operations import Formula
 from lfrtorch.maps.static_map import StaticMap
 from lfrtorch.maps.written import Vectors, Written
 from lfrtorch.model.data_reach import DataReach
@@ -50,6 +52,7 @@ class Equations:
         y  = Cy x + Dyu v + Dyw w + y_offset
 
     Args:
+        name: of the model in an export.
         matrices: A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw; nz = nw = 0 of a linear model.
         u_offset, y_offset: operating point.
         x_rest: state at rest under u_offset, (nx,); empty if none was found. x = 0 is near it.
@@ -61,6 +64,7 @@ class Equations:
         reach: how far the data of the fit went; None if that is not known.
     """
 
+    name: str
     matrices: Matrices
     u_offset: Array
     y_offset: Array
@@ -91,7 +95,7 @@ class Equations:
         M = self.matrices
         return bool(M.Dyu.any()) or bool(M.Dyw.any() and M.Dzu.any())
 
-    def about(self, name: str, place: str = "{0}[{1}]") -> list[str]:
+    def about(self, place: str = "{0}[{1}]") -> list[str]:
         """What a reader of the export should know: equations, channels, units, offsets, rate."""
         # ``place`` is how its language writes a channel: letter {0}, number from 0 {1} and from 1
         # {2}.
@@ -101,7 +105,8 @@ class Equations:
             static = ["z      = Cz x + Dzu v", f"w      = f(z) = {meaning}"]
             w, bw, kind = " + Dyw w", " + Bw w", "nonlinear"
         return [
-            f"{name}: a {kind} state-space model in physical units, sampled at {self.fs:g} Hz,",
+            f"{self.name}: a {kind} state-space model in physical units, sampled at "
+            f"{self.fs:g} Hz,",
             f"by lfrtorch {version('lfrtorch')}.",
             "",
             "    v      = u - u_offset",
@@ -113,7 +118,7 @@ class Equations:
             *_signals(place, "y", self.outputs, self.y_offset, self.reach and self.reach.y),
         ]
 
-    def description(self, name: str) -> dict[str, Any]:
+    def description(self) -> dict[str, Any]:
         """Name, rate, state at rest and channels, for JSON."""
         sides = ("inputs", self.inputs, self.u_offset), ("outputs", self.outputs, self.y_offset)
         ends = {} if self.reach is None else {"inputs": self.reach.u, "outputs": self.reach.y}
@@ -124,7 +129,7 @@ class Equations:
         for side, ranges in ends.items():
             for channel, (least, most) in zip(found[side], ranges.tolist(), strict=True):
                 channel |= {"least": least, "most": most}
-        known = {"name": name, "fs": self.fs, "states": self.sizes["nx"]}
+        known = {"name": self.name, "fs": self.fs, "states": self.sizes["nx"]}
         return known | {"x_rest": self.x_rest.tolist(), **found}
 
     @property
@@ -147,19 +152,26 @@ class Equations:
             x_next["Bw"], y["Dyw"] = w, w
         return language.total("x_next", x_next), language.total("y", y, "y_offset")
 
-    def rendered(self, template: str, name: str, **more: Any) -> str:
-        """A text of this room's folder ``templates`` for the model, and ``more`` that it has."""
+    def rendered(
+        self, template: str, operations: Mapping[str, str] | None = None, **more: Any
+    ) -> str:
+        """A text of the folder ``templates`` with all of this and ``more``.
+
+        Formulas have statements in the text's language, if it has ``operations``.
+        """
         import jinja2
+
+        def written(formula: Formula, place: str) -> tuple[list[tuple[str, str]], list[str]]:
+            inputs = [place.format(i) for i in range(formula.inputs)]
+            return statements(formula, inputs, operations or {})
 
         environment = jinja2.Environment(
             loader=jinja2.PackageLoader("lfrtorch.export"),
             trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
         )  # fmt: skip
-        known = {"name": name, "NAME": name.upper(), "rest": self.x_rest.size, **self.sizes}
-        known |= {"map": self.map, "written": self.written, "weights": self.weights}
-        known |= {"feedthrough": self.feedthrough, "arrays": self.arrays}
-        known["distance"] = self.distance
-        return environment.get_template(template).render(known | more)
+        known = {"NAME": self.name.upper(), "rest": self.x_rest.size, **self.sizes, **vars(self)}
+        known |= {n: getattr(self, n) for n in ("arrays", "distance", "feedthrough")}
+        return environment.get_template(template).render(known | {"statements": written} | more)
 
 
 def _signals(
@@ -184,9 +196,12 @@ def printable(text: str) -> str:
 
 
 def equations(
-    model: Model | LinearModel, own: Callable[[Module, int], Written | None] = lambda *_: None
+    model: Model | LinearModel,
+    name: str = "model",
+    own: Callable[[Module, int], Written | None] = lambda *_: None,
 ) -> Equations:
     """The equations of a model; ``own`` writes a static map of nz inputs that has none itself."""
+    check_name(name)
     model = model.to_model()
     cell, s = double(model.lfr.cell), model.scaler
     written = cell.map.written
@@ -200,6 +215,7 @@ def equations(
         )
     M, y_scale = cell.matrices(), s.y_scale[:, None]
     found = Equations(
+        name=name,
         matrices=M._replace(
             Bu=M.Bu / s.u_scale, Dzu=M.Dzu / s.u_scale,
             Cy=M.Cy * y_scale, Dyu=M.Dyu * y_scale / s.u_scale, Dyw=M.Dyw * y_scale,

@@ -52,10 +52,10 @@ def write_fmu(
 def fmu(model: Model | LinearModel, name: str, version: int) -> bytes:
     """The archive that an FMU is."""
     header, source = c_source(model, name)
-    e = equations(model)
+    e = equations(model, name)
     known: dict[str, Any] = {"version": version, "u_start": e.u_offset.tolist()}
     known["guid"] = str(uuid.uuid5(uuid.NAMESPACE_OID, header + source))
-    known |= {"title": " ".join(e.about(name)[:2]), "ts": repr(1.0 / e.fs)}
+    known |= {"title": " ".join(e.about()[:2]), "ts": repr(1.0 / e.fs)}
     known["variables"] = _variables(e) if version == 3 else _variables(e)[:-1]  # FMI 3 has the time
     known["units"] = list(dict.fromkeys(unit for _, unit, *_ in known["variables"] if unit))
     # Which inputs each output depends on, and at the beginning which states.
@@ -65,13 +65,13 @@ def fmu(model: Model | LinearModel, name: str, version: int) -> bytes:
     known["depends"] = [(first + np.flatnonzero(row)).tolist() for row in by_u]
     known["states"] = [first + nu + ny + i for i in range(e.sizes["nx"])]
     files = {f"{name}.h": header, f"{name}.c": source}
-    files[f"{name}_fmu.c"] = e.rendered("fmu.c", name, **known)
+    files[f"{name}_fmu.c"] = e.rendered("fmu.c", **known)
     archive, machine = io.BytesIO(), "linux64" if version == 2 else "x86_64-linux"
     with ZipFile(archive, "w", ZIP_DEFLATED) as made:
         made.writestr(f"binaries/{machine}/{name}.so", _compiled(files, name))
-        made.writestr("modelDescription.xml", e.rendered("fmu.xml", name, **known))
+        made.writestr("modelDescription.xml", e.rendered("fmu.xml", **known))
         if version == 3:
-            made.writestr("sources/buildDescription.xml", e.rendered("fmu_build.xml", name))
+            made.writestr("sources/buildDescription.xml", e.rendered("fmu_build.xml"))
         for file, text in files.items():
             made.writestr(f"sources/{file}", text)
     return archive.getvalue()

@@ -9,7 +9,7 @@ import numpy as np
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.lpv_form import lpv
-from lfrtorch.export.equations import check_name, equations, observer_equations
+from lfrtorch.export.equations import equations, observer_equations
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.extended_kalman_filter import NoiseCovariance
 from lfrtorch.model.model import Model
@@ -53,9 +53,8 @@ def matlab_function(
         >>> variables["fs"], variables["A"].shape
         (100.0, (1, 1))
     """
-    check_name(name)
     model = model.to_model()
-    e = equations(model)
+    e = equations(model, name)
     if e.map.nw and not e.weights:
         raise InputError(
             "this static map has no MATLAB code, which is made of arrays; export it to c, casadi, "
@@ -68,7 +67,7 @@ def matlab_function(
     for side, channels in (("input", e.inputs), ("output", e.outputs)):
         found[f"{side}_names"] = np.array([c.name for c in channels], dtype=object)[:, None]
         found[f"{side}_units"] = np.array([c.unit for c in channels], dtype=object)[:, None]
-    known: dict[str, Any] = {"about": e.about(name, "{0}({2})"), "schedule": form.schedule}
+    known: dict[str, Any] = {"about": e.about("{0}({2})"), "schedule": form.schedule}
     numbers = observer_equations(model, observer)
     known |= dict.fromkeys(numbers.roots, True)
     literals |= numbers.covariances
@@ -80,9 +79,9 @@ def matlab_function(
         found["lpv"] |= {"nodes": e.map.quadrature.t, "weights": e.map.quadrature.weight}
     known["literals"] = [(n, _literal(w)) for n, w in literals.items()]
     templates = {"": "model.m", "_lpv": "model_lpv.m", "_numbers": "model_numbers.m"}
-    texts = {f"{name}{end}.m": e.rendered(file, name, **known) for end, file in templates.items()}
+    texts = {f"{name}{end}.m": e.rendered(file, **known) for end, file in templates.items()}
     for part in ("start", "correct", "advance") if observer is not False else ():
-        texts[f"{name}_{part}.m"] = e.rendered("model_observer.m", name, part=part, **known)
+        texts[f"{name}_{part}.m"] = e.rendered("model_observer.m", part=part, **known)
     return texts, found | literals
 
 

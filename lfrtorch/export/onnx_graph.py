@@ -14,7 +14,7 @@ from torch.nn import Module
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
-from lfrtorch.export.equations import Equations, check_name, equations
+from lfrtorch.export.equations import Equations, equations
 from lfrtorch.export.traced_map import IR, OPSET, traced
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.operations import Formula
@@ -52,8 +52,7 @@ def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, A
         >>> [one.name for one in sample.graph.input], [one.name for one in simulation.graph.output]
         (['x', 'u'], ['x_end', 'y'])
     """
-    check_name(name)
-    e = equations(model, _own)
+    e = equations(model, name, _own)
     nx, nu, ny = (e.sizes[size] for size in ("nx", "nu", "ny"))
     graph = Graph(imported("onnx", "onnx"), e.arrays)
     e.sample(graph, "x", "u")
@@ -70,7 +69,7 @@ def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, A
     )  # fmt: skip
     ends = {"x0": ["n", nx], "u": ["n", "T", nu]}, {"x_end": ["n", nx], "y": ["n", "T", ny]}
     simulation = graph.of(name, [scan], *ends)
-    return graph.model(sample(name), e, name), graph.model(simulation, e, name)
+    return graph.model(sample(name), e), graph.model(simulation, e)
 
 
 def _own(static: Module, nz: int) -> Written:
@@ -191,7 +190,7 @@ class Graph:
         ends = ([value(n, kind, s) for n, s in side.items()] for side in (inputs, outputs))
         return self.onnx.helper.make_graph(nodes, name, *ends, [*constants])
 
-    def model(self, graph: Any, e: Equations, name: str) -> Any:
+    def model(self, graph: Any, e: Equations) -> Any:
         """A graph with its operators' version and the metadata."""
         model = self.onnx.helper.make_model(
             graph,
@@ -199,8 +198,8 @@ class Graph:
             opset_imports=[self.onnx.helper.make_opsetid("", OPSET)],
             producer_name="lfrtorch",
             producer_version=version("lfrtorch"),
-            doc_string="\n".join(e.about(name)),
+            doc_string="\n".join(e.about()),
         )
-        described = {key: json.dumps(value) for key, value in e.description(name).items()}
+        described = {key: json.dumps(value) for key, value in e.description().items()}
         self.onnx.helper.set_model_props(model, described)
         return model

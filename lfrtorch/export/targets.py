@@ -18,7 +18,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.export.c_source import c_source
 from lfrtorch.export.casadi_function import casadi_function, casadi_observer, casadi_reach
 from lfrtorch.export.control_system import python_source
-from lfrtorch.export.equations import check_name, equations
+from lfrtorch.export.equations import equations
 from lfrtorch.export.fmu import fmu
 from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
@@ -56,9 +56,9 @@ def _c(model: Model | LinearModel, name: str, **options: Any) -> dict[str, str |
 def _casadi(
     model: Model | LinearModel, name: str, observer: bool | NoiseCovariance
 ) -> dict[str, str | bytes]:
-    e = equations(model)
+    e = equations(model, name)
     found: dict[str, Any] = {".casadi": casadi_function(model, name)}
-    found["_channels.json"] = json.dumps(e.description(name), indent=2) + "\n"
+    found["_channels.json"] = json.dumps(e.description(), indent=2) + "\n"
     if e.distance is not None:
         found["_reach.casadi"] = casadi_reach(model.to_model(), name)
     if observer is not False:
@@ -173,7 +173,6 @@ def write(
     """
     if to not in TARGETS:
         raise InputError(f"to is {to!r}; give one of {', '.join(TARGETS)}.")
-    check_name(name)
     if disturbance is not None:
         if not isinstance(observer, NoiseCovariance):
             raise InputError(
