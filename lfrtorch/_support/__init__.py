@@ -1,1 +1,1 @@
-"""What every room uses and no user sees: checks, drawing, errors, files, tables, threads, types."""
+"""Internal helpers of all rooms: checks, drawing, errors, files, tables, threads, types."""

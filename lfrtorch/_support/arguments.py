@@ -1,4 +1,4 @@
-"""Arguments of public functions are of the types that their hints name, or a message says so."""
+"""Check of the arguments of public functions against the types that their hints name."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NAMES: dict[Any, str] = {
 
 
 def typed(*own: str) -> Callable[[Function], Function]:
-    """Let a function or class refuse arguments of other types than its hints name.
+    """Make a function or class refuse arguments of other types than its hints name.
 
     Numbers and arrays alone are left to the function, and so are the arguments ``own``.
     """
@@ -67,7 +67,7 @@ def typed(*own: str) -> Callable[[Function], Function]:
 
 
 def is_of(value: Any, hint: Any) -> bool:
-    """Return whether a value is of the type of a hint; True if the hint is not looked at."""
+    """Tell if a value is of the type of a hint; True if the hint is not checked."""
     first, *others = _members(hint)
     if others:
         return any(is_of(value, one) for one in (first, *others))
@@ -99,21 +99,21 @@ def is_of(value: Any, hint: Any) -> bool:
 
 
 def _members(hint: Any) -> tuple[Any, ...]:
-    """Return the members of a union and of its aliases; of another hint itself alone."""
-    hint = getattr(hint, "__value__", hint)  # of numpy's ArrayLike from numpy 2.5 on
+    """Return the members of a union and of its aliases; any other hint is its only member."""
+    hint = getattr(hint, "__value__", hint)  # numpy's ArrayLike from numpy 2.5 on
     if get_origin(hint) not in _UNIONS:
         return (hint,)
     return tuple(one for each in get_args(hint) for one in _members(each))
 
 
 def wanted(hint: Any) -> str:
-    """Say what a hint asks for."""
+    """Describe the type that a hint asks for."""
     *others, last = _choices(hint)
     return f"{', '.join(others)} or {last}" if others else last
 
 
 def _choices(hint: Any) -> list[str]:
-    """Say what a hint asks for, one text for each kind."""
+    """Describe the types that a hint asks for, one text for each kind."""
     kinds, arrays = _members(hint), _members(ArrayLike)
     if len(kinds) > 1:
         if not set(arrays) <= set(kinds):
@@ -130,7 +130,7 @@ def _choices(hint: Any) -> list[str]:
 
 
 def _several(hint: Any, others: tuple[Any, ...]) -> list[str]:
-    """Say that several of another kind can be given, too, if they can."""
+    """Add that several of a kind can be given, if they can."""
     alike = get_origin(hint) is Sequence and set(_choices(get_args(hint)[0])) <= {
         text for one in others if one is not hint for text in _choices(one)
     }

@@ -1,4 +1,4 @@
-"""A file that is written whole or not at all."""
+"""Atomic writes: a file or folder is written whole or not at all."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import real
 
 TEMPORARY = ".lfrtorch-"
-"""How the names of files and folders begin that are not whole yet."""
+"""Prefix of the names of unfinished files and folders."""
 
 
 def refuse_existing(path: str | Path, option: str) -> None:
@@ -43,13 +43,13 @@ def whole_file(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def _writing_to(folder: Path) -> Iterator[None]:
-    """Name the folder in errors of the system."""
+    """Name the folder in errors of the operating system."""
     try:
         yield
     except OSError as error:
         named = folder if error.filename is None else real(os.fsdecode(error.filename))
         ours = folder == named or folder in named.parents or named in folder.parents
-        if error.strerror is None or not ours:  # it says more, or is of another file
+        if error.strerror is None or not ours:  # the error says more, or names another file
             raise
         raise OSError(f"'{folder}' cannot be written to: {error.strerror}") from error
 
@@ -70,10 +70,10 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 def _put(fresh: Path, path: Path) -> None:
-    """Let a file or folder that is whole take its place; first on the disk, as power may fail."""
+    """Move a finished file or folder to its place, flushed to the disk first: power may fail."""
     full = 0o777 if fresh.is_dir() else 0o666
     _flush(fresh)
-    os.chmod(fresh, full & ~_umask())  # what tempfile makes is its owner's alone
+    os.chmod(fresh, full & ~_umask())  # files of tempfile are readable by their owner alone
     os.replace(fresh, path)
     _flush(path.parent)
 
@@ -89,7 +89,7 @@ def _flush(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what a killed program left unfinished in a folder that no other writes to."""
+    """Remove unfinished files of a killed program, in a folder that no other program writes to."""
     for path in list(folder.glob(f"{TEMPORARY}*")):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -98,7 +98,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _umask() -> int:
-    """Return the permissions that new files do not get."""
+    """Return the umask: permissions that new files do not get."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

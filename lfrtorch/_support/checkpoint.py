@@ -21,8 +21,8 @@ from lfrtorch._support.paths import expanded, real
 FORMAT = "lfrtorch"
 VERSION = 1
 DESCRIPTION, _WEIGHTS = "model.json", "weights.safetensors"
-_NEXT = "next.safetensors"  # weights while another model takes the place of a checkpoint's
-_DIGEST = "sha256"  # in the metadata of tensors: tells damaged ones, which may still be numbers
+_NEXT = "next.safetensors"  # name of the weights while another model replaces a checkpoint
+_DIGEST = "sha256"  # in the metadata of tensors: detects damage that leaves valid numbers
 
 # Extensions of files that may carry code: none of them belongs to a checkpoint.
 _CODE = (".pt", ".pth", ".ckpt", ".pkl", ".pickle", ".joblib", ".py", ".pyc", ".so")
@@ -84,7 +84,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
-    """SHA-256 of all that a file of tensors says."""
+    """SHA-256 of the names, shapes and values of a file of tensors."""
     found = sha256(repr(sorted(metadata.items())).encode())
     for name, tensor in sorted(tensors.items()):
         found.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
@@ -133,7 +133,7 @@ def read(
 
 
 def _below(folder: Path, at: str, inside: Sequence[str]) -> list[str]:
-    """Checkpoints whose paths match a pattern."""
+    """List checkpoints whose paths match a pattern."""
     return [
         str(path)
         for path in sorted(folder.glob(at))
@@ -143,7 +143,7 @@ def _below(folder: Path, at: str, inside: Sequence[str]) -> list[str]:
 
 
 def _located(folder: Path, inside: Sequence[str]) -> Path:
-    """The folder that holds the description; refuse all else, code above all."""
+    """Find the folder that holds the description; refuse all else, code above all."""
     if folder.is_file():
         raise InputError(
             f"'{folder}' is a file, and a checkpoint is a folder with {DESCRIPTION} and "
@@ -190,7 +190,7 @@ def _describe(path: Path, description: dict[str, Any]) -> None:
 
 
 def _described(folder: Path) -> dict[str, Any]:
-    """The description in a checkpoint, empty if it is damaged."""
+    """Read the description in a checkpoint; empty if it is damaged."""
     try:
         found = json.loads((folder / DESCRIPTION).read_text())
     except (OSError, ValueError, RecursionError):
@@ -199,5 +199,5 @@ def _described(folder: Path) -> dict[str, Any]:
 
 
 def _occupied(folder: Path) -> bool:
-    """Whether ``folder`` is a file or a folder that is not empty."""
+    """Tell if ``folder`` is a file, or a folder that is not empty."""
     return not folder.is_dir() or any(folder.iterdir())

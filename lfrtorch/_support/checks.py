@@ -1,4 +1,4 @@
-"""Checks at the door: an argument of the right type and size, or a message that names it."""
+"""Checks of arguments: the right type and size, or an error that names the argument."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lfrtorch._support.types import Array, Integers
 
 
 def integer(name: str, value: Any, least: int, *, word: str = "") -> None:
-    """Refuse what is not a whole number of at least ``least``, nor a word, with a ValueError."""
+    """Refuse all but a whole number of at least ``least``, or a word, with a ValueError."""
     if word and isinstance(value, str) and value == word:
         return
     whole = isinstance(value, Integral) and not isinstance(value, bool)
@@ -28,13 +28,13 @@ def integer(name: str, value: Any, least: int, *, word: str = "") -> None:
 
 
 def true_or_false(name: str, value: Any) -> None:
-    """Refuse what is neither True nor False with a ValueError."""
+    """Refuse all but True and False with a ValueError."""
     if not isinstance(value, bool):
         raise InputError(f"{name} is {value!r}; give True or False.")
 
 
 def band(given: Any) -> None:
-    """Refuse what is not a pair of numbers with a ValueError."""
+    """Refuse all but a pair of numbers with a ValueError."""
     pair = isinstance(given, Sequence | np.ndarray) and len(given) == 2
     if not pair or not all(isinstance(f, Real) for f in given):
         raise InputError(f"band is {given}; give two numbers, the lowest and the highest in Hz.")
@@ -72,7 +72,7 @@ def dft_lines(given: ArrayLike, samples: int) -> Integers:
 
 
 def number(name: str, value: Any, *, positive: bool = False, most: float | None = None) -> None:
-    """Refuse what is not a real number of at least (``positive``: above) 0 with a ValueError."""
+    """Refuse all but a real number of at least (``positive``: above) 0 with a ValueError."""
     wanted = "a positive number" if positive else "a number of at least 0"
     wanted += "" if most is None else f", {most} at most"
     real = isinstance(value, Real) and not isinstance(value, bool) and float(value) < math.inf

@@ -1,4 +1,4 @@
-"""What all figures share: colours, axes in units, legends."""
+"""Common parts of all figures: colours, axes in units, legends."""
 
 from __future__ import annotations
 
@@ -11,12 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 from lfrtorch._support.tables import engineering, factor_of
 from lfrtorch._support.types import Array
 
-OUTPUT, LINEAR, NL_LFR = "0.15", "#e69f00", "#0072b2"
-"""Colours of the measured output, the linear model and the NL-LFR, of Okabe and Ito's palette:
-colour-blind readers tell them apart, and they differ in lightness."""
+# Okabe and Ito's palette: colour-blind readers tell its colours apart, which differ in lightness.
+
+OUTPUT = "0.15"
+"""Colour of the measured output."""
+
+LINEAR = "#e69f00"
+"""Colour of the linear model."""
+
+NL_LFR = "#0072b2"
+"""Colour of the NL-LFR."""
 
 CHANNELS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Colours of several channels, of the same palette."""
+"""Colours of several channels."""
 
 _LOG_DECADES = 1.5  # width of a band from which on the frequency axis is logarithmic
 
@@ -83,5 +90,5 @@ def unit_label(what: str, output: str, source: str) -> str:
 
 
 def reference(unit: str) -> str:
-    """Say in a label what 0 dB is."""
+    """Label of the reference, the value of 0 dB."""
     return f", re 1 {unit}" if unit else ""

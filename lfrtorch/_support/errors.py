@@ -1,22 +1,22 @@
-"""The errors of this package: what a caller can mend, or what ended a run."""
+"""Errors of this package: those that a caller can mend, and those that end a run."""
 
 from __future__ import annotations
 
 
 class LfrtorchError(Exception):
-    """An error that the package raises with a message for its user; any other is a bug."""
+    """Error that the package raises with a message for its user; any other error is a bug."""
 
 
 LONGEST = 160
-"""Characters of another library's message that are shown."""
+"""Number of characters of another library's message that are shown."""
 
 _LONGEST_INPUT_ERROR = 1000  # characters of a message, which may hold a value that was given
 
 
 class InputError(LfrtorchError, ValueError):
-    """What was given cannot be used: the message says what was expected and what to do.
+    """Unusable argument or file: the message says what was expected and what to do.
 
-    The middle of a long one, which holds what was given, is left out.
+    The middle of a long message, which shows the value that was given, is left out.
     """
 
     def __init__(self, message: str) -> None:

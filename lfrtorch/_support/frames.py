@@ -1,4 +1,4 @@
-"""Data frames of pandas: whether something is one, its times, and a frame of results like it."""
+"""Data frames of pandas: recognition, times, and frames of results."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from lfrtorch._support.types import Array
 
 
 def is_frame(value: Any) -> bool:
-    """Whether it is a data frame; nobody has one who has not imported pandas."""
+    """Tell if a value is a data frame, without importing pandas."""
     pandas = sys.modules.get("pandas")
     return pandas is not None and isinstance(value, pandas.DataFrame)
 
 
 def index_times(frame: Any) -> Array | None:
-    """The index in seconds from its first entry; None if it only counts rows or is no time."""
+    """Index in seconds from its first entry; None if it counts rows or is no time."""
     import pandas as pd
 
     index = frame.index
@@ -37,10 +37,10 @@ def index_times(frame: Any) -> Array | None:
 
 
 def index_grid(frame: Any, fs: float | None, used: Sequence[int] = ()) -> tuple[float, Piece]:
-    """The sampling frequency in Hz, and the places of the rows on a grid of it, by the index.
+    """Sampling frequency in Hz, and positions of the rows on its grid, from the index.
 
-    With ``fs`` an index that is uneven is put on a grid of that rate. Columns but ``used`` may
-    number runs, which are refused: they are several records.
+    An uneven index is put on a grid of ``fs``, if given. Several runs, numbered by a column that
+    is not ``used``, are refused: they are several records.
     """
     names = [name for name, _ in names_and_units([*map(str, frame.columns)], {})]
     labels = {
@@ -104,7 +104,7 @@ def check_index(frame: Any, fs: float) -> None:
 
 
 def _labels(column: Any) -> NDArray[Any]:
-    """Numbers or words that may number runs."""
+    """Numbers or words of a column that may number runs."""
     import pandas as pd
 
     number = pd.api.types.is_numeric_dtype(column.dtype)
@@ -112,7 +112,7 @@ def _labels(column: Any) -> NDArray[Any]:
 
 
 def places_of(frame: Any, wanted: Sequence[str], side: str) -> list[int]:
-    """Numbers of columns by header, "force (N)", or by the name in it; messages name the side."""
+    """Positions of columns by header, "force (N)", or by the name in it; messages name the side."""
     headers = [str(column) for column in frame.columns]
     names = [name for name, _ in names_and_units(headers, {})]
     found = []
@@ -126,7 +126,7 @@ def places_of(frame: Any, wanted: Sequence[str], side: str) -> list[int]:
 
 
 def columns_of(frame: Any, wanted: Sequence[int]) -> Array:
-    """Columns as numbers (rows, columns), NaN for missing ones."""
+    """Values of columns (rows, columns), NaN where missing."""
     import pandas as pd
 
     parts = []

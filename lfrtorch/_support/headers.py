@@ -1,4 +1,4 @@
-"""Headers of columns as people write them: "force (N)", "force [N]" or "force/N"."""
+"""Column headers with units: "force (N)", "force [N]" or "force/N"."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ _BRACKETS = re.compile(r"(.*)[(\[]([^()\[\]]*)[)\]]")
 
 
 def is_unit(text: str) -> bool:
-    """Whether it is written as a unit, as N, mm or m/s^2."""
+    """Tell if a text looks like a unit: N, mm or m/s^2."""
     return _UNIT.fullmatch(text) is not None
 
 
 def bracketed(text: str) -> str | None:
-    """What stands in brackets, if that is all."""
+    """Text in brackets, if a header is nothing else."""
     name, inside = _parts(text)
     return inside if inside and not name.strip() else None
 
 
 def _parts(header: str) -> tuple[str, str]:
-    """What stands before the brackets at its end and in them; empty if nothing is that short."""
+    """Parts of a header before and in its last brackets; empty without short ones at its end."""
     found = _BRACKETS.fullmatch(header)
     inside = found[2].strip() if found else ""
     return (found[1], inside) if found and 0 < len(inside) <= 16 else (header, "")
@@ -36,7 +36,7 @@ def names_and_units(
 ) -> tuple[tuple[str, str], ...]:
     """Split headers into names and units; ``units`` are known already, by header."""
     # Brackets stay in the name if names would be equal without them, or if they follow the name
-    # at once and hold no unit, as in "y(t)".
+    # directly and hold no unit, as in "y(t)".
     found = [(header, units[header]) if units.get(header) else _split(header) for header in headers]
     count = Counter(channel[0] for channel in found)
     return tuple(

@@ -1,4 +1,4 @@
-"""Memory that a computation takes, against what the machine has."""
+"""Memory that a computation needs, compared with the memory of the machine."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _UNITS = ("kB", "MB", "GB", "TB", "PB", "EB")
 
 
 def check_memory(needed: float, what: str, remedy: str, device: torch.device | None = None) -> None:
-    """Refuse what takes more bytes than a device (default: the CPU) has, and say the remedy."""
+    """Refuse a computation that needs more bytes than a device (default: the CPU) has."""
     there = memory_of(device)
     if needed > there:
         raise InputError(
@@ -25,7 +25,7 @@ def check_memory(needed: float, what: str, remedy: str, device: torch.device | N
 
 
 def memory_of(device: torch.device | None = None) -> float:
-    """Return the bytes that a device has, or a container or process may take; inf if unknown."""
+    """Return the bytes of a device, or the limit of a container or process; inf if unknown."""
     if device is not None and device.type == "cuda":
         import torch
 
@@ -39,7 +39,7 @@ def memory_of(device: torch.device | None = None) -> float:
 
 
 def _own_limit() -> float:
-    """Return what ``ulimit -v`` leaves this process, as batch systems set it."""
+    """Return the limit ``ulimit -v`` of this process, as batch systems set it."""
     try:
         import resource
     except ImportError:  # not on Windows
@@ -50,7 +50,7 @@ def _own_limit() -> float:
 
 def limit_of(listed: Path, mounted: Path) -> float:
     """Return the least memory limit of the control groups of a process, inf if there is none."""
-    # ``listed`` has a line a group, ``mounted`` what each may take; groups limit those in them.
+    # ``listed`` has a line for each group, ``mounted`` the limits; a group limits those inside it.
     # Linux kernel documentation, "Control Group v2", and its v1 with "memory.limit_in_bytes".
     try:
         groups = [line.split(":", 2)[1:] for line in listed.read_text().splitlines()]

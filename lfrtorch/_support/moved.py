@@ -1,4 +1,4 @@
-"""Modules that have moved into rooms: a path of before leads to the same module."""
+"""Import paths of modules that have moved: the old path gives the same module."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ MOVED = {
     "data_reach": "model", "state_observer": "model", "extended_kalman_filter": "model",
     "known": "model", "file_simulation": "use",
 }  # fmt: skip
-"""Names below ``lfrtorch``, and their rooms."""
+"""Names of moved modules below ``lfrtorch``, with their rooms."""
 
 
 class _Paths(MetaPathFinder, Loader):
-    """Finds the modules by their paths of before."""
+    """Finder of the modules by their old paths."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -39,5 +39,5 @@ class _Paths(MetaPathFinder, Loader):
 
 
 def install() -> None:
-    """Let them be imported by these paths, too."""
+    """Make the old paths importable."""
     sys.meta_path.append(_Paths())

@@ -1,4 +1,4 @@
-"""Checkpoints of versions before, as this one writes them."""
+"""Checkpoints of earlier versions, converted to the present form."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 SCALING = ("u_offset", "u_scale", "y_offset", "y_scale")
-"""Fields of a scaler, in a checkpoint."""
+"""Fields of a scaler in a checkpoint."""
 
 Checkpoint = tuple[dict[str, Any], dict[str, Tensor]]
 """A description and its weights."""
 
 
 def innermost(description: dict[str, Any]) -> tuple[Any, int]:
-    """The static map that a description names, and how many canonical coordinates are around it."""
+    """Static map that a description names, and the number of canonical coordinates around it."""
     own, folds = description.get("static"), 0
     while isinstance(own, dict) and own.get("type") == "Beyond":
         own, folds = own.get("base"), folds + 1
@@ -23,10 +23,10 @@ def innermost(description: dict[str, Any]) -> tuple[Any, int]:
 
 
 def of_today(description: dict[str, Any], weights: dict[str, Tensor]) -> Checkpoint:
-    """The same model in the form of today: linear models, canonical forms, covariances.
+    """Convert a model to the present form: linear models, canonical forms, covariances.
 
-    Which entries a fit holds stands in the description of some (``structure``, ``feedthrough``),
-    and is read with the model.
+    The entries that a fit holds stand in the description of some (``structure``,
+    ``feedthrough``), and are read with the model.
     """
     weights = dict(weights)
     if "sizes" not in description:

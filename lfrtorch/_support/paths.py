@@ -1,4 +1,4 @@
-"""Paths that a user gave."""
+"""Paths given by a user."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ def expanded(path: str | Path) -> Path:
     """Expand ``~`` in a path; refuse one that no file can have, too long or of an unknown user."""
     try:
         found = Path(path).expanduser()
-        found.is_file()  # an error, unless there may be such a file
-        if "\0" in str(found):  # which is none to pathlib
+        found.is_file()  # an error, unless a file has that name
+        if "\0" in str(found):  # pathlib has no error for it
             raise ValueError("it has a zero byte")
     except (OSError, RuntimeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -22,5 +22,5 @@ def expanded(path: str | Path) -> Path:
 
 
 def real(path: str | Path) -> Path:
-    """Return the path without links, as far as it is there; loops of links stay."""
+    """Resolve links as far as the path exists; loops of links stay."""
     return Path(os.path.realpath(path))

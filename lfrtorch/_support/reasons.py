@@ -1,4 +1,4 @@
-"""Why a search or a fit ended."""
+"""Reasons for the end of a search or a fit."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from enum import StrEnum
 
 
 class Reason(StrEnum):
-    """Why a search or a fit ended; a member equals its text, which files hold and people read.
+    """Reason for the end of a search or a fit; a member equals its text in files and reports.
 
-    A trainer of one's own may give other texts.
+    A user's trainer may give other texts.
 
     Example:
         >>> result = lfrtorch.fit(model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=2))
@@ -31,12 +31,12 @@ class Reason(StrEnum):
 
 
 SPENT = (Reason.ALL_ITERATIONS, Reason.ALL_EPOCHS)
-"""Reasons of a search that may go on if it is given more iterations."""
+"""Reasons of a search that more iterations would continue."""
 
 CUT_SHORT = (Reason.INTERRUPTED, Reason.PROCESS_LOST)
-"""Reasons of a fit that something else ended."""
+"""Reasons of a fit that was interrupted from outside."""
 
 
 def told(reason: str, detail: str) -> str:
-    """The reason, with the detail if there is one."""
+    """Text of a reason, with its detail if there is one."""
     return f"{reason}: {detail}" if detail else reason

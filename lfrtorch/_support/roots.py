@@ -1,4 +1,4 @@
-"""Poles and zeros as an engineer reads them: frequency, damping, radius."""
+"""Frequency, damping and radius of poles and zeros."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from lfrtorch._support.types import Complex
 
 
 def frequency_and_damping(values: Complex, fs: float) -> list[dict[str, float | None]]:
-    """Describe poles or zeros z = exp(s / fs): frequency |s| / 2π in Hz, damping ratio, radius.
+    """Frequency |s| / 2π in Hz, damping ratio and radius of poles or zeros z = exp(s / fs).
 
-    A conjugate pair counts once. The frequency is at most fs / 2, as of a negative root, which
-    alternates from sample to sample; of a root at 0 it is not known.
+    A conjugate pair counts once. The frequency is at most fs / 2, the value for a negative root,
+    which alternates from sample to sample; a root at 0 has none.
     """
     listed = []
     for z in sorted(values[values.imag >= 0], key=lambda z: (abs(np.angle(z)), abs(z))):
@@ -37,13 +37,13 @@ def frequency_and_damping(values: Complex, fs: float) -> list[dict[str, float | 
 
 
 def beyond(root: Mapping[str, Any]) -> bool:
-    """Tell if the frequency is above fs / 2, which stands for it."""
+    """Tell if the true frequency is above fs / 2, the value that stands for it."""
     z = complex(root["real"], root["imag"])
     return z != 0 and abs(cmath.log(z)) > math.pi
 
 
 def remark(root: Mapping[str, Any], *, pole: bool) -> str:
-    """Say that a root stands for two or is above fs / 2, and that a pole is unstable."""
+    """Remark on a root that stands for two or is above fs / 2, or on an unstable pole."""
     said = {
         "pair": bool(root["imag"]),
         "above fs / 2": beyond(root),

@@ -1,4 +1,4 @@
-"""Runs that stand below one another in one table: where each begins."""
+"""Several runs below one another in one table, and the sample at which each begins."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _WORDS = (
 )
 _ENDINGS = "id", "no", "nr", "num", "number", "index", "idx", "name"
 _NAMES = re.compile(rf"({'|'.join(_WORDS)})s?([ _.-]?({'|'.join(_ENDINGS)}))?|id", re.IGNORECASE)
-_LEAST = 20  # samples of most runs
-_AGAIN = 10  # steps: so much later than the one before a run may begin
+_LEAST = 20  # least samples of most runs
+_AGAIN = 10  # steps: latest begin of a run after the end of the run before
 
 
 class Runs(NamedTuple):
-    """Samples at which runs begin, from 0, their names, and what told them; one run has no name."""
+    """First samples of the runs, from 0, their names and evidence; a single run has no name."""
 
     starts: Integers
     names: tuple[str, ...] = ("",)
@@ -31,12 +31,12 @@ class Runs(NamedTuple):
 
 
 def is_run(name: str) -> bool:
-    """Tell whether a column is named as the number of a run is, as ``run`` or ``trial_id``."""
+    """Tell if the name of a column is one for run numbers, as ``run`` or ``trial_id``."""
     return _NAMES.fullmatch(name) is not None
 
 
 def find_runs(T: int, labels: Mapping[str, NDArray[Any]], t: Array | None = None) -> Runs:
-    """Runs by columns of labels (T,), each constant in a run, and by times (T,) that begin again.
+    """Find runs by columns of labels (T,), constant in each run, or by times (T,) that restart.
 
     A column counts if each of its values stands in one stretch, most of 20 samples or more.
     """
@@ -55,7 +55,7 @@ def find_runs(T: int, labels: Mapping[str, NDArray[Any]], t: Array | None = None
 
 
 def restarts(t: Array) -> Integers:
-    """Samples at which a clock begins again where it began before; none if it falls elsewhere."""
+    """Samples at which a clock returns to its first time; none if it also falls to other times."""
     falls = np.flatnonzero(np.diff(t) < 0) + 1
     starts = np.append(0, falls)
     if not falls.size or np.median(np.diff(np.append(starts, len(t)))) < _LEAST:
@@ -65,7 +65,7 @@ def restarts(t: Array) -> Integers:
 
 
 def _changes(labels: NDArray[Any]) -> Integers:
-    """Samples at which a column changes that has each of its values in one long stretch."""
+    """Samples at which a column changes, if each of its values fills one long stretch."""
     found = np.flatnonzero(labels[1:] != labels[:-1]) + 1
     lengths = np.diff(np.concatenate([[0], found, [len(labels)]]))
     several = 0 < found.size < len(labels) and np.median(lengths) >= _LEAST
@@ -76,5 +76,5 @@ def _changes(labels: NDArray[Any]) -> Integers:
 
 
 def _label(value: Any) -> str:
-    """A label as it stands in the name of a record."""
+    """Label as part of a record's name."""
     return f"{value:.0f}" if isinstance(value, float | np.floating) else str(value).strip()

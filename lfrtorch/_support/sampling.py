@@ -1,4 +1,4 @@
-"""Even grids of time: that of time stamps, or one that signals are interpolated to."""
+"""Even grids of time: the grid of time stamps, or a grid for interpolation."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Booleans, Integers
 
-_GAP = 1.5  # steps: from here on samples are missing
-_OFTEN = 0.1  # of the samples: if more steps seem to be gaps, the stamps are rounded
-_ROUNDED = 1.01  # digits: how far a stamp may be from there if the last digit rounds
+_GAP = 1.5  # steps between stamps from which on samples are missing
+_OFTEN = 0.1  # part of the samples: with more gaps than that, the stamps are rounded
+_ROUNDED = 1.01  # digits: largest distance of a stamp from the grid if the last digit rounds
 _HOLE = 5.0  # steps without a sample that no line is drawn over
 _SAME = 1e-3  # relative: sampling frequencies that do not contradict one another
 
@@ -22,21 +22,21 @@ class Sampling(NamedTuple):
     """An even grid of samples."""
 
     fs: float  # Hz
-    uncertainty: float  # of fs, relative, from the digits of the stamps
+    uncertainty: float  # relative error of fs, from the digits of the stamps
     gaps: Integers  # samples that follow a gap
-    missing: Integers  # how many samples each gap has
-    unit: str = ""  # what the stamps are taken to be in, if their column does not say it
+    missing: Integers  # number of samples of each gap
+    unit: str = ""  # unit of the stamps, if their column does not name it
 
     def __str__(self) -> str:
-        """What a column is taken for: the unit, the frequency and how far it may be off."""
+        """Interpretation of a column: its unit, the frequency and its uncertainty."""
         unit = f" in {self.unit}" if self.unit else ""
-        # A frequency that is known as well needs no word on that.
+        # A frequency of the same certainty is printed without it.
         off = f" ± {100 * self.uncertainty:.1g} %" if self.uncertainty > 1e-3 else ""
         return f"the time{unit}, {self.fs:.6g} Hz{off}"
 
 
 class UnevenError(InputError):
-    """A column that is no even grid of time: what it does, at which sample, and a remedy."""
+    """Error of a column that is no even grid of time: its fault, the sample, and a remedy."""
 
     def __init__(
         self, message: str, sample: int, remedy: str = "resample the signals to an even grid"
@@ -46,16 +46,16 @@ class UnevenError(InputError):
 
 
 class Piece(NamedTuple):
-    """Samples without a hole between them, by their places on an even grid."""
+    """Samples without a hole between them, by their positions on an even grid."""
 
-    rows: Integers  # (n,), of the time stamps
+    rows: Integers  # (n,), positions among the time stamps
     places: Array  # (n,), in steps from the first one
     start: float  # steps from the first time stamp
     usual: float  # step between samples, in steps of the grid, at least 1
 
     @classmethod
     def of(cls, first: int, end: int) -> Piece:
-        """Samples that are taken as they come."""
+        """Piece of all samples, as they come."""
         rows = np.arange(first, end)
         return cls(rows, (rows - first).astype(np.float64), 0.0, 1.0)
 
@@ -71,7 +71,7 @@ class Piece(NamedTuple):
         return np.column_stack(lines) if lines else np.empty((len(k), 0))
 
     def missing(self) -> Booleans:
-        """Tell whether there is no sample at or next to a point of the grid."""
+        """Tell if there is no sample at or next to a point of the grid."""
         k = self._grid()
         if len(self.places) < 2:
             return np.zeros(len(k), bool)
@@ -85,7 +85,7 @@ class Piece(NamedTuple):
 
 
 class EvenTimes(NamedTuple):
-    """Samples on an even grid, in pieces between holes, and what was uneven."""
+    """Samples on an even grid, in pieces between holes, with a note on uneven stamps."""
 
     grid: Sampling
     pieces: list[Piece]
@@ -93,21 +93,21 @@ class EvenTimes(NamedTuple):
 
     @property
     def interpolated(self) -> bool:
-        """Tell whether samples are not as they came, but for those that are missing or left out."""
+        """Tell if samples were changed, apart from missing and omitted ones."""
         return any((np.rint(piece.places) != piece.places).any() for piece in self.pieces)
 
 
 def even_times(t: Array, fs: float | None = None, *, whole: bool = False) -> EvenTimes:
-    """Places of samples on an even grid of their own rate, or of ``fs`` in Hz.
+    """Positions of samples on an even grid of their own rate, or of ``fs`` in Hz.
 
-    Stamps of an even grid keep their samples as they are. Others are on lines between the samples,
-    at their usual rate; of stamps that stand twice the first counts, and where more than one in ten
-    do, the clock is coarse and samples share its ticks evenly.
+    Samples with even stamps stay as they are. Others are interpolated linearly at their usual rate.
+    The first sample counts where a stamp stands twice. If more than one stamp in ten does, the
+    clock is coarse, and samples share its ticks evenly.
 
     Args:
         t: time stamps in seconds (T,).
-        fs: default the rate of the stamps.
-        whole: whether every sample that is missing is a hole, and not five steps without one.
+        fs: rate of the grid in Hz. Default: the rate of the stamps.
+        whole: every missing sample is a hole; otherwise five steps without one are.
 
     Raises:
         UnevenError: stamps that do not rise.
@@ -137,7 +137,7 @@ def even_times(t: Array, fs: float | None = None, *, whole: bool = False) -> Eve
 
 
 def _usual(steps: Array) -> float:
-    """The step that half of all have, or else their mean without holes."""
+    """Step of at least half of all samples, or else the mean step without holes."""
     median = float(np.median(steps))
     if np.count_nonzero(np.abs(steps - median) <= 0.01 * median) > len(steps) / 2:
         return median
@@ -145,7 +145,7 @@ def _usual(steps: Array) -> float:
 
 
 def _pieces(rows: Integers, places: Array, usual: float, *, whole: bool) -> list[Piece]:
-    """Samples between holes."""
+    """Pieces of samples between holes."""
     hole = _GAP if whole else _HOLE
     cuts = np.flatnonzero(np.diff(places) > hole * usual - 1e-6) + 1
     if cuts.size and cuts[0] == 1:  # a sample from before the measurement
@@ -158,7 +158,7 @@ def _pieces(rows: Integers, places: Array, usual: float, *, whole: bool) -> list
 
 
 def _without_odd(t: Array) -> tuple[Integers, Sampling | None]:
-    """The grid of all samples but the first, or but some whose stamps stand twice."""
+    """Grid of all samples but the first, or but some whose stamps stand twice."""
     alone = np.flatnonzero(np.diff(t, prepend=-np.inf) > 0)
     for rows in (np.arange(1, len(t)), alone):
         if len(t) - len(rows) <= _OFTEN * len(t):
@@ -168,11 +168,11 @@ def _without_odd(t: Array) -> tuple[Integers, Sampling | None]:
 
 
 def _rising(t: Array) -> tuple[Integers, Array]:
-    """Samples, and times that rise from 0, of stamps of which some stand twice."""
+    """Samples, and times that rise from 0, from stamps of which some stand twice."""
     first = np.flatnonzero(np.diff(t, prepend=-np.inf) > 0)
     if len(t) - len(first) <= _OFTEN * len(t):
         return first, t[first] - t[0]
-    # Behind the last tick time goes on as before it.
+    # Time continues behind the last tick as before it.
     k, ticks = np.append(first, len(t)), np.append(t[first], t[-1])
     ticks[-1] += (len(t) - first[-1]) * (t[-1] - t[0]) / first[-1]
     rows = np.arange(len(t))
@@ -180,7 +180,7 @@ def _rising(t: Array) -> tuple[Integers, Array]:
 
 
 def sampling(t: Array) -> Sampling:
-    """Return the even grid of time stamps (s), up to rounding; refuse uneven ones."""
+    """Even grid of time stamps (s), up to rounding; refuse uneven stamps."""
     if len(t) < 2:
         raise UnevenError("has one sample", 0)
     digit, steps = _last_digit(t), np.diff(t)
@@ -196,7 +196,7 @@ def sampling(t: Array) -> Sampling:
 
 
 def _rounded(t: Array, digit: float) -> bool:
-    """Tell whether all stamps are on one grid but for a last digit that shows now and then."""
+    """Tell if all stamps are on one grid up to rounding of a last digit that most stamps lack."""
     steps, k = np.diff(t), np.arange(len(t)) - (len(t) - 1) / 2
     away = t - t.mean()
     away -= k * (k @ away) / (k @ k)  # the line of least squares is off by digit / sqrt(T)
@@ -206,7 +206,7 @@ def _rounded(t: Array, digit: float) -> bool:
 
 
 def _grid(t: Array, digit: float, gaps: Integers) -> Sampling:
-    """The grid of stamps between gaps, each within ``digit`` and the jitter of its place."""
+    """Grid of stamps between gaps, each within ``digit`` and the jitter of its position."""
     steps = np.diff(t)
     within = np.delete(steps, gaps - 1)
     mean = float(within.mean()) if within.size else 0.0
@@ -223,7 +223,7 @@ def _grid(t: Array, digit: float, gaps: Integers) -> Sampling:
     place = np.arange(len(t)) - np.repeat(starts, lengths)
     away = t - np.repeat(t[starts], lengths) - place * mean
     away -= np.repeat(np.add.reduceat(away, starts) / lengths, lengths)
-    # Jitter: so far, in steps, a stamp may be from its place in an even grid.
+    # Jitter: largest distance, in steps, of a stamp from its position in an even grid.
     far = np.abs(away) > 0.1 * mean + _ROUNDED * digit
     if far.any():
         twice = np.flatnonzero(steps == 0) + 1
@@ -240,7 +240,7 @@ def _grid(t: Array, digit: float, gaps: Integers) -> Sampling:
             int(np.argmax(odd)) + 1,
         )
     rounding = 4 * float(np.spacing(np.abs(t).max()))
-    if np.ptp(within) > 2 * rounding:  # else the digits hold the step exactly
+    if np.ptp(within) > 2 * rounding:  # otherwise the digits represent the step exactly
         rounding = max(rounding, digit or _last_digit(t))
     uncertainty = rounding * len(starts) / float(within.sum())
     missing = np.maximum(np.rint(steps[gaps - 1] / mean).astype(np.int64) - 1, 1)
@@ -248,7 +248,7 @@ def _grid(t: Array, digit: float, gaps: Integers) -> Sampling:
 
 
 def _last_digit(t: Array) -> float:
-    """What the last digit counts of stamps that were printed, or kept in single precision."""
+    """Unit of the last digit of stamps that were printed, or stored in single precision."""
     largest = float(np.abs(t).max())
     with np.errstate(over="ignore"):  # beyond single precision
         single = t.astype(np.float32)
@@ -262,7 +262,7 @@ def _last_digit(t: Array) -> float:
 
 
 def _roundest(value: float, uncertainty: float) -> float:
-    """The number of the fewest digits that is as good."""
+    """Number with the fewest digits that is as accurate."""
     for digits in range(16):
         found = float(f"{value:.{digits}e}")
         if abs(found - value) <= uncertainty * value:

@@ -1,4 +1,4 @@
-"""Settings that are declared once: default, help text and limits of a field of a dataclass."""
+"""Declaration of settings: default, help text and limits of a field of a dataclass."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Kind = TypeVar("Kind", bound=type)
 def setting(default: Any, help: str, **limits: Any) -> Any:
     """Declare a field of a dataclass; a default that is a class is called anew for each object.
 
-    Limits are keywords of ``checks.integer`` if ``least`` is one of them, or of ``checks.number``.
+    Limits are keywords of ``checks.integer`` if they include ``least``, else of ``checks.number``.
     """
     given: dict[str, Any] = {"default_factory" if callable(default) else "default": default}
     return field(**given, metadata={"help": help, "limits": limits})
@@ -22,7 +22,7 @@ def setting(default: Any, help: str, **limits: Any) -> Any:
 
 def check_settings(settings: Any, prefix: str = "", without: Container[str] = ()) -> None:
     """Refuse values beyond their limits; None passes if it is the default."""
-    # Help needs the declarations alone: numpy is imported with the first check.
+    # Numpy is imported with the first check: help texts need the declarations alone.
     from lfrtorch._support.checks import integer, number
 
     for one in fields(settings):

@@ -1,4 +1,4 @@
-"""Numbers and tables for people: the same on a terminal and in the report of a run."""
+"""Numbers and tables as text: the same on a terminal and in the report of a run."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from statistics import median_high
 from tabulate import tabulate
 
 UNKNOWN = "–"
-"""What stands for a number that is not known or not finite."""
+"""Text in place of a number that is not known or not finite."""
 
 _DIGITS = 3  # significant digits of a number
 _SMALLEST, _LARGEST = 1e-3, 1e5  # numbers in this range are written without an exponent
 _PLAIN = 0.1, 1000.0  # numbers in this range need no prefix
-_PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}  # by the power of ten
+_PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}  # by power of ten
 
-# Units that may have a prefix; others, such as °C, kg, mm and %, stay as they are.
+# Units that may have a prefix; others, such as °C, kg, mm and %, get none.
 _PREFIXED = frozenset(
     ("A", "C", "F", "H", "Hz", "J", "N", "N m", "N/m", "N·m", "Nm", "Ohm", "Pa", "T", "V", "W",
      "m", "m/s", "m/s2", "m/s^2", "m/s²", "rad", "rad/s", "rad/s2", "rad/s^2", "rad/s²", "s", "Ω")
 )  # fmt: skip
-_NEVER_LARGER = ("s", "rad")  # what units begin with that are never kilo or more
+_NEVER_LARGER = ("s", "rad")  # first letters of units that are never kilo or more
 
-# Near the unit circle 1 - |p| is printed instead of four digits of |p|; on it, nothing but 1.
+# Near the unit circle 1 - |p| is printed instead of four digits of |p|; on the circle, 1 alone.
 _NEAR, _ROUNDING = 1e-3, 1e-12
 
 WIDEST = 160
-"""Characters of a line of a message."""
+"""Most characters of a line of a message."""
 
 Cell = str | int | float | None
 
@@ -55,10 +55,10 @@ def number(value: float | None, digits: int = _DIGITS) -> str:
 
 
 def engineering(values: Iterable[float | None], unit: str, shown: str = "") -> tuple[float, str]:
-    """Return the factor and unit with SI prefix that numbers of a unit are read best in.
+    """Factor and unit with the SI prefix in which numbers of a unit are read best.
 
-    One for all, so that they compare: their median is between 0.1 and 1000 there. ``shown`` asks
-    for a unit with a prefix, whatever the numbers. A unit that takes no prefix stays as it is.
+    All numbers share the factor, so that they can be compared; it brings their median between 0.1
+    and 1000. ``shown`` asks for a certain unit. A unit that takes no prefix stays as it is.
     """
     for power, prefix in _PREFIXES.items():
         if shown and shown == prefix + unit:

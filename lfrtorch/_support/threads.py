@@ -1,4 +1,4 @@
-"""Work on several threads without OpenMP, and tensors as the compiled code in them takes them."""
+"""Parallel work on threads without OpenMP, and conversion of tensors for compiled code."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _workers: ContextVar[int | None] = ContextVar("workers", default=None)
 
 
 def workers() -> int:
-    """Return the number of threads that work is spread over."""
+    """Number of threads that work is spread over."""
     return _workers.get() or torch.get_num_threads()
 
 
 @contextmanager
 def spread_by_hand() -> Iterator[None]:
-    """Inside, torch itself works on one thread, and ``spread`` on as many as torch had.
+    """Context in which torch works on one thread, and ``spread`` on as many as torch had.
 
-    torch's own threads (OpenMP) wait for each other spinning. Where small operations follow each
-    other, or another process shares the cores, that costs more than it gives: on two cores a
-    Jacobian that takes 3 ms to set up took 73, and an iteration of 27 ms up to 630. The same holds
-    for the linear algebra of numpy and scipy: a decomposition of 15 ms took 80.
+    torch's own threads (OpenMP) spin while they wait for each other. The spinning costs more than
+    it gains where small operations follow each other, or another process shares the cores: on two
+    cores a Jacobian of 3 ms took 73 ms, and an iteration of 27 ms up to 630 ms. The same holds for
+    the linear algebra of numpy and scipy: a decomposition of 15 ms took 80 ms.
     """
     count = workers()
     token = _workers.set(count)
@@ -54,7 +54,7 @@ _changing, _limited, _inside = threading.Lock(), ExitStack(), set[object]()
 
 @contextmanager
 def _one_blas_thread() -> Iterator[None]:
-    """Keep BLAS, which all threads share, on one thread until the last one has left."""
+    """Keep BLAS, which all threads share, on one thread until the last context ends."""
     own = object()
     with _changing:
         if not _inside:
@@ -94,9 +94,9 @@ def spread(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:
 
 
 def spread_loop(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:
-    """``spread`` of a kernel that loops: ``kernel(first, jobs, step, *arguments)``.
+    """Spread a kernel that loops over its jobs: ``kernel(first, jobs, step, *arguments)``.
 
-    To call compiled code takes as long as it works on 50 samples.
+    One call of compiled code costs as much time as 50 samples of its work.
     """
     threads = min(jobs, workers())
     if threads <= 1:
@@ -106,9 +106,9 @@ def spread_loop(kernel: Callable[..., None], jobs: int, *arguments: object) -> N
 
 
 def worth_threads(samples: int, parameters: int = 70) -> bool:
-    """Return whether fits of this size gain by threads of their own.
+    """Tell if fits of this size gain from a thread each.
 
-    Those of smaller ones wait for the interpreter: starts of 200 to 4000 samples and some 70
+    Threads of smaller fits wait for the interpreter: starts of 200 to 4000 samples and some 70
     parameters took 1.0 to 1.6 times as long on two cores as on one.
     """
     return samples * parameters**2 >= 4e7
@@ -121,9 +121,9 @@ def each_alone(
     *,
     threads: bool = True,
 ) -> list[Result]:
-    """Return ``work`` of each item, a thread each; if one fails, or at Ctrl-C, call ``stop``.
+    """Apply ``work`` to each item in its own thread; if one fails, or at Ctrl-C, call ``stop``.
 
-    Without ``threads``, or if there is one only, one item after the other.
+    Items follow one another without ``threads``, or if there is one thread only.
     """
 
     def alone(item: Item) -> Result:
@@ -165,19 +165,19 @@ if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's
 
 
 COMPILED_ON = {"cpu"}
-"""Devices that have compiled kernels; all else runs in torch, parallel in time."""
+"""Devices with compiled kernels; others run in torch, parallel in time."""
 
 
 def has_kernels(tensor: Tensor) -> bool:
-    """Whether compiled kernels serve the tensor's device."""
+    """Tell if the tensor's device has compiled kernels."""
     return tensor.device.type in COMPILED_ON
 
 
 def to_numpy(tensor: Tensor) -> NDArray:
-    """A CPU tensor as a contiguous array for compiled code."""
+    """Convert a CPU tensor to a contiguous array for compiled code."""
     return tensor.detach().contiguous().numpy()
 
 
 def to_float64(tensor: Tensor) -> NDArray[np.float64]:
-    """A tensor of any device as a contiguous array of float64."""
+    """Convert a tensor of any device to a contiguous array of float64."""
     return tensor.detach().cpu().double().contiguous().numpy()

@@ -1,1 +1,1 @@
-"""Records, by use, and their scores."""
+"""Records by use, and their scores."""

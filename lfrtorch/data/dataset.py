@@ -1,4 +1,4 @@
-"""A dataset: records by use, and the published results they are compared with."""
+"""Dataset: records by use, and published results for comparison."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ LISTED = 3
 
 @dataclass(frozen=True)
 class Published:
-    """Simulation RMSE of one published model on the test records, for the table beside ours.
+    """Simulation RMSE of a published model on the test records, for comparison.
 
     Args:
         label: column head, for example ``"NL-LFR (paper)"``.
-        scores: RMSE in the output's unit, by the name of the test record; of one of several outputs
-            by the names of both, as ``"multisine acc1"``.
-        reference: where it was published.
+        scores: RMSE in the output's unit, by the name of the test record; one of several outputs
+            has the names of both, as ``"multisine acc1"``.
+        reference: source of the numbers.
         sizes: (nz, nw) if the number belongs to one model size only.
-        unit: the output's with the prefix that tables shall have, ``"µm"`` for example. Default:
+        unit: unit of the output with the prefix for tables, ``"µm"`` for example. Default:
             tables choose one.
 
     Example:
@@ -58,11 +58,11 @@ class Undecided(NamedTuple):
 
 @dataclass(frozen=True)
 class Dataset:
-    """Records by use: fitted, chosen on, and scored.
+    """Records by use: training, validation, selection and tests.
 
     Args:
         name: the benchmark's name, or the file's stem.
-        train: records that are fitted; here and below a single one may stand without a list.
+        train: records that are fitted; here and below a single record needs no list.
         validation: records that choose among iterates and starts; never fitted.
         selection: more records that choose among starts, and not among the iterates of one: at
             other amplitudes, for example.
@@ -70,21 +70,21 @@ class Dataset:
         noise_rms: rms of the measurement noise added to simulated estimation data, output unit;
             ``None`` for measured data.
         published: results of others on the same tests.
-        linear: training records that a test's own linear model is estimated from, by the names of
-            test or group and of records; others have the linear model of all records.
-        notes: what a reader of the scores should know of the data, a sentence each.
-        seed: that simulated data were drawn with.
-        groups: test or validation records that make one score together, by its name and theirs: the
-            mean of the RMSE of each output of each record.
-        ahead: what is scored of predictions from measured starts, by name: functions of outputs
-            predicted and measured, (n, horizon, ny) each, that return errors (n, horizon); a score
-            is the sum over the horizon of their means.
-        leaderboard: test records as nonlinearbenchmark.org has them scored: cut by the package
-            nonlinear_benchmarks, the start state fitted to the samples that it leaves unscored.
+        linear: training records from which the linear model of a test is estimated, by the names
+            of test or group and of records. Other tests have the linear model of all records.
+        notes: remarks on the data for readers of the scores, a sentence each.
+        seed: seed of simulated data.
+        groups: names of test or validation records that make one score, by its name: the mean of
+            the RMSE of each output of each record.
+        ahead: scores of predictions from measured starts, by name: functions of predicted and
+            measured outputs, (n, horizon, ny) each, that return errors (n, horizon). A score is
+            the sum over the horizon of their means.
+        leaderboard: test records as nonlinearbenchmark.org scores them: cut by the package
+            nonlinear_benchmarks, with the start state fitted to the samples left unscored.
         undecided: training records of which an identification chooses how they begin.
 
     Raises:
-        ValueError: something else than records.
+        ValueError: anything but records.
 
     Example:
         >>> data = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[record[200:]])
@@ -124,12 +124,12 @@ class Dataset:
             object.__setattr__(self, use, records)
 
     def with_windows(self) -> Dataset:
-        """Set windows for the scores of estimated starts that leave them open."""
+        """Set the scored samples of estimated starts that do not give them."""
         held_out = ("validation", "selection", "tests")
         return replace(self, **{use: [*map(with_window, getattr(self, use))] for use in held_out})
 
     def score_of(self, record: Record) -> str:
-        """The name of the score that a record counts for: its group's, or its own."""
+        """Name of the score to which a record belongs: its group's, or its own."""
         for name, records in self.groups.items():
             if record.name in records:
                 return name

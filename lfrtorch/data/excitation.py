@@ -1,4 +1,4 @@
-"""Random-phase multisines: the periodic excitation that tells noise from nonlinear distortion."""
+"""Random-phase multisines: periodic excitation that separates noise from nonlinear distortion."""
 
 from __future__ import annotations
 
@@ -81,20 +81,20 @@ def multisine(
     each other.
 
     Args:
-        samples: N, of one period.
+        samples: number N of samples in one period.
         fs: sampling frequency in Hz.
         band: lowest and highest frequency in Hz. Default: all lines between 0 and fs / 2.
         lines: numbers (F,) of the DFT lines to choose from, instead of a band.
-        grid: which of these are excited: ``"full"`` all; ``"odd"`` the odd ones; ``"random_odd"``
+        grid: excited lines among these: ``"full"`` all; ``"odd"`` the odd ones; ``"random_odd"``
             the odd ones except one of every ``group`` in a row, drawn at random. The lines that
             are not excited show nonlinear distortion and noise.
-        group: odd lines of a group.
+        group: number of odd lines in a group.
         rms: root mean square of each input, in every experiment.
         amplitude: relative amplitudes of the lines 0 to N / 2, of which the excited ones count.
             Default: all equal.
         nu: inputs.
         realisations: number of independent ones, nu experiments each.
-        seed: of phases and lines, or a generator to draw them from.
+        seed: seed of phases and lines, or a generator to draw them from.
 
     Shape:
         rms: () or (nu,), amplitude: (N // 2 + 1,) or (N // 2 + 1, nu).
@@ -143,7 +143,7 @@ def multisine(
 def _candidates(
     samples: int, fs: float, band: tuple[float, float] | None, lines: ArrayLike | None
 ) -> Integers:
-    """The lines that the grid chooses from, rising; fs / 2 itself has no free phase."""
+    """Candidate lines of the grid, rising; fs / 2 itself has no free phase."""
     last = (samples - 1) // 2
     if lines is not None:
         if band is not None:
@@ -178,7 +178,7 @@ def _on_grid(lines: Integers, grid: Any, group: int, generator: np.random.Genera
         )
     if grid == "odd":
         return odd
-    groups = odd.size // group  # what follows the last whole group is excited
+    groups = odd.size // group  # lines after the last whole group are excited
     dropped = np.arange(groups) * group + generator.integers(group, size=groups)
     return np.delete(odd, dropped)
 

@@ -1,4 +1,4 @@
-"""Scores of a simulated output against a measured one, in physical units, after the skip window."""
+"""Scores of a simulated against a measured output, in physical units, after the skipped samples."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ def rmse_by_output(record: Record, y_hat: Array) -> Array:
 def nrmse(record: Record, y_hat: Array) -> float:
     """RMSE over the standard deviation of the measured output, both over the scored samples.
 
-    Several outputs are each taken over their own deviation: the root mean square of theirs, without
-    those that are constant there. NaN if none is left.
+    Each of several outputs is divided by its own deviation. The result is the root mean square over
+    the outputs that are not constant; NaN if there are none.
 
     Example:
         >>> lfrtorch.nrmse(record, bla.simulate(record)) < 0.3
         True
     """
     outputs = [y[there] for y, there in zip(record.y.T, record.scored.T, strict=True)]
-    # About the first sample, so that those of a constant are 0: its mean has rounding errors.
+    # Deviation from the first sample: exactly 0 for a constant, whose mean has rounding errors.
     deviations = np.array([np.std(y - y[0]) if len(y) else 0.0 for y in outputs])
     rmse(record, y_hat)  # refuses other shapes
     moved = deviations > 0
@@ -79,7 +79,7 @@ class BlockScores:
         self._mean, self._spread, self._errors = np.zeros((3, ny))
 
     def add(self, y: Array, y_hat: Array) -> None:
-        """Take in the next samples (n, ny), measured and simulated."""
+        """Add the next samples (n, ny), measured and simulated."""
         left_out = min(self._skip, len(y))
         self._skip -= left_out
         y, y_hat = y[left_out:], y_hat[left_out:]
@@ -88,12 +88,12 @@ class BlockScores:
         there = np.isfinite(y)
         added = there.sum(axis=0)
         first = (self.samples == 0) & (added > 0)
-        # Samples of a constant are then 0 about the mean so far.
+        # Samples of a constant then have no deviation from the mean so far.
         self._mean[first] = y[there.argmax(axis=0), np.arange(len(first))][first]
         whole = np.maximum(self.samples + added, 1)
         y = np.where(there, y, self._mean)
-        # About the mean so far, by the update of Chan, Golub and LeVeque (1983): exact, and
-        # without the cancellation of a sum of squares.
+        # Deviations from the mean so far, by the update of Chan, Golub and LeVeque (1983): exact,
+        # and without the cancellation of a sum of squares.
         shift = (y - self._mean).sum(axis=0) / np.maximum(added, 1)
         self._spread += np.where(there, (y - self._mean - shift) ** 2, 0.0).sum(axis=0)
         self._spread += shift**2 * self.samples * added / whole

@@ -1,20 +1,19 @@
-"""Which of several models do as well as the best: errors on the same samples, compared in pairs.
+"""Comparison of models by their errors on the same samples, in pairs.
 
-By the one-standard-error rule the smallest model is taken whose error is within one standard error
-of the best. All models are scored on the same samples and share their noise, which says nothing of
-one against another; what tells two apart is the difference of their squared errors, and the
-standard error is that of its mean. That difference is correlated in time, so its means over ten
-blocks are taken as independent: they are if a block is long against the system's memory.
-The usual form, with the standard error of the best model's own error, is blind if noise is
-large: a mean square above it by 1.4 %, three standard errors of the difference over 2600 samples,
-is half of one of its own. Of two models that are equally good the smaller is taken in 83 % of
-cases.
+The one-standard-error rule takes the smallest model whose error is within one standard error of the
+best. All models are scored on the same samples and share their noise, so that two models differ by
+the difference of their squared errors alone. The standard error is that of its mean. The difference
+is correlated in time, so its means over ten blocks are treated as independent. They are, if a block
+is long compared with the system's memory. The usual form, with the standard error of the best
+model's own error, misses differences if noise is large: a mean square larger by 1.4 % is three
+standard errors of the difference over 2600 samples, and half a standard error of its own. If two
+models are equally good, the smaller one is taken in 83 % of cases.
 
-Long records tell apart what is not worth a parameter (on the Silverbox 25 neurons are better than 5
-by 0.6 % and two standard errors), so a model within 1 % of the best does as well. Where a few
-resonances or impacts make up most of the error, one standard error can be a fifth of it, and the
-smallest model that is so near leaves out just these; so by default no model more than 5 % above
-the best does as well.
+Long records resolve differences that are not worth a parameter: on the Silverbox 25 neurons are
+better than 5 by 0.6 %, or two standard errors. So a model within 1 % of the best counts as equally
+good. If a few resonances or impacts make up most of the error, one standard error can be a fifth of
+it, and the smallest model within it leaves out just these. So no model more than 5 % above the best
+counts as equally good by default.
 
 References:
     Hastie, Tibshirani and Friedman, "The Elements of Statistical Learning", 2nd ed., 2009, section
@@ -35,7 +34,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Booleans, Integers
 
 MARGIN = 0.01
-"""A model does as well as the best if its rms error exceeds that one's by at most this part."""
+"""Relative excess of the rms error up to which a model counts as equally good as the best."""
 
 BLOCKS = 10
 """Least number of blocks of time, over all records."""
@@ -43,7 +42,7 @@ BLOCKS = 10
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """The order of models by their errors: orders, sizes, starts, an NL-LFR and its linear model.
+    """Judge of models by their errors: orders, sizes, starts, an NL-LFR and its linear model.
 
     Args:
         squares: sums of squared errors of each model in each block of time; infinite if it
@@ -59,20 +58,20 @@ class Judge:
 
     @classmethod
     def of(cls, errors: Sequence[Sequence[Array]]) -> Judge:
-        """That of models by their errors (T, ny) on each record."""
+        """Judge from the errors (T, ny) of models on each record."""
         blocks = in_blocks([e[:, 0] for e in errors[0]])
         counts = np.array([len(block) for block in blocks])
         return cls(np.array([squares_in_blocks(each) for each in errors]), counts)
 
     def ranked(self) -> list[int]:
-        """The models, the least error first; of equal ones the first is first."""
+        """Models by rising error; equal ones keep their order."""
         sums = self.squares.sum(axis=1)
         return np.argsort(np.where(np.isnan(sums), inf, sums), kind="stable").tolist()
 
     def as_good(self, *, errors: float = 1.0, most: float = 1.05) -> Booleans:
-        """Return which models do as well as the best.
+        """Mask of the models that are as good as the best.
 
-        Their mean squares are within so many standard ``errors`` of the least and their rms errors
+        Their mean squares are within ``errors`` standard errors of the least and their rms errors
         at most ``most`` times as large, or within ``MARGIN``.
         """
         means = self.squares.sum(axis=1)
@@ -81,11 +80,11 @@ class Judge:
         return near | (means <= (1.0 + MARGIN) ** 2 * means.min())
 
     def first_good(self) -> int:
-        """The first model that does as well as the best."""
+        """First model that is as good as the best."""
         return int(np.argmax(self.as_good()))
 
     def above(self) -> Array:
-        """How far the mean squares of models are above the least, in its standard errors."""
+        """Excess of the mean squares of models over the least, in standard errors."""
         best = int(np.argmin(self.squares.sum(axis=1)))
         with np.errstate(invalid="ignore", divide="ignore"):
             difference, error = blocked_mean(self.squares - self.squares[best], self.counts)
@@ -93,7 +92,7 @@ class Judge:
         return np.where(np.isfinite(above), above, inf)
 
     def ratio(self) -> tuple[float, float]:
-        """The second model's rms error over the first one's, and its standard error."""
+        """Ratio of the second model's rms error to the first one's, and its standard error."""
         base, squares = self.squares
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             ratio = sqrt(squares.sum() / base.sum()) if base.any() else 1.0
@@ -105,7 +104,8 @@ class Judge:
     def middle(self, most: float, least_error: float) -> tuple[float, float]:
         """Mean log ratio of the second model's errors over the blocks, and its errors from 0.
 
-        A ratio beyond ``most`` counts as that: a block in which one runs away is one of many.
+        A ratio beyond ``most`` counts as ``most``, so that a block in which one diverges has little
+        weight.
         """
         base, squares = self.squares
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -116,7 +116,7 @@ class Judge:
 
 
 def no_progress(errors: Sequence[float], last: int) -> bool:
-    """Return whether none of the last few rms errors is below the earlier ones by ``MARGIN``."""
+    """Tell if none of the last few rms errors is below the earlier ones by ``MARGIN``."""
     earlier = errors[:-last]
     return bool(earlier) and min(errors[-last:]) > min(earlier) / (1.0 + MARGIN)
 
@@ -127,14 +127,14 @@ def blocked_mean(sums: Array, counts: Integers) -> tuple[Array, Array]:
     mean = sums.sum(axis=-1) / samples
     rest = sums - mean[..., None] * counts
     largest = np.abs(rest).max(axis=-1)
-    parts = rest / np.where(largest > 0.0, largest, 1.0)[..., None]  # whose squares are numbers
+    parts = rest / np.where(largest > 0.0, largest, 1.0)[..., None]  # their squares do not overflow
     return mean, largest * np.sqrt(B / (B - 1.0) * (parts**2).sum(axis=-1)) / samples
 
 
 def squares_in_blocks(errors: Sequence[Array]) -> Array:
     """Return sums of squared errors over each block of time; infinite if one is not finite.
 
-    The errors of each record are (T, ny); the outputs' mean counts.
+    The errors of each record are (T, ny); squares are averaged over the outputs.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         blocks = in_blocks([np.mean(error**2, axis=1) for error in errors])

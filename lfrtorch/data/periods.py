@@ -1,4 +1,4 @@
-"""Periods of a measured input, and how many of them the output takes to settle."""
+"""Periods of a measured input, and the number of periods until the output has settled."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ _GROWTH = 1.5
 _BEGINNING = 1 / 3  # share of the record in which an input may differ from what it repeats later
 _NEAR = 2.0  # the shortest period counts as good if its D is within this factor of the best
 _EXACT = 1e-9  # difference of what repeats exactly, far above rounding
-_FASTER = 0.75  # of the record: the largest shift that is looked at
+_FASTER = 0.75  # largest shift that is tried, relative to the record
 
 _SETTLED = 2.0  # mean square difference of settled periods, relative to noise, at most
 _SMALL = 1e-5  # rms difference over that of the output which is no transient, noise or not
-_TAIL = 4  # of two periods' difference, its last 1 / 4 is taken for noise
+_TAIL = 4  # last part of the difference of two periods that is taken for noise
 
 
 def find_period(u: Array) -> int | None:
-    """Return the shortest period, in samples, that explains the signals; None if none repeats.
+    """Shortest period, in samples, that explains the signals; None if none repeats.
 
-    For every shift p up to half the record,
+    Every shift p up to half the record has a relative difference,
 
         D(p) = sum (u(k + p) - u(k))^2 / sum (u(k + p)^2 + u(k)^2),  u about its mean,
 
-    is 0 for a period, 1 for unrelated signals and the noise-to-signal ratio for a period in noise.
-    A period is a p whose D is at a minimum and small, and stays small for 2 p, 3 p, ... A transient
-    in its first periods, which a measured input may have, makes it no longer. Constant signals do
+    which is 0 for a period, 1 for unrelated signals and the noise-to-signal ratio for a period in
+    noise. A period is a p whose D is a small minimum, and stays small for 2 p, 3 p, ... A transient
+    in the first periods, which a measured input may have, does not lengthen it. Constant signals do
     not count. Shape of u: (T, nu) or (T,).
     """
     u = u.reshape(len(u), -1)
@@ -59,7 +59,7 @@ def find_period(u: Array) -> int | None:
 
 
 def _shortest(D: Array, T: int) -> int | None:
-    """The shortest period of T samples that differ by D(p)."""
+    """Shortest period of T samples with the differences D(p)."""
     p = np.arange(2, T // 2 + 1)
     D_next = np.append(D, np.inf)[p + 1]
     minima = p[(D[p] < D[p - 1]) & (D[p] <= D_next) & (D[p] < _ALIKE)]
@@ -68,18 +68,18 @@ def _shortest(D: Array, T: int) -> int | None:
         return None
     best = D[periods].min()
     shortest = next(i for i in periods if D[i] <= _NEAR * best + _EXACT)
-    # Of a slow signal in noise there are several about the period, and far multiples tell.
+    # A slow signal in noise has several minima near the period; distant multiples decide.
     return int(min((i for i in periods if i < 2 * shortest - 1), key=lambda i: D[i::i].mean()))
 
 
 def _stays_small(D: Array) -> bool:
-    """Whether D of 1, 2, ... periods is that of noise, a drift or a transient."""
+    """Tell if D of 1, 2, ... periods is that of noise, a drift or a transient."""
     most = np.maximum(_GROWTH * np.arange(1, len(D) + 1), 3.0) * D[0] + _EXACT
     return bool((np.minimum(most, _ALIKE) > D).all())
 
 
 def _differences(u: Array) -> Array:
-    """D(p) of the signal that repeats worst, p = 0, 1, ... to three quarters of the record."""
+    """Differences D(p) of the signal that repeats worst, p = 0, 1, ... to 3/4 of the record."""
     T = len(u)
     last = max(int(_FASTER * T), T // 2)
     worst = np.zeros(last + 1)
@@ -90,25 +90,25 @@ def _differences(u: Array) -> Array:
         )
         energy = np.concatenate([[0.0], np.cumsum(x**2)])
         both = energy[T - last : T + 1][::-1] + energy[T] - energy[: last + 1]
-        both = np.where(both > 0, both, np.inf)  # nothing there is no repetition
+        both = np.where(both > 0, both, np.inf)  # a signal that is zero does not repeat
         found = np.where(np.isinf(both), 1.0, 1 - 2 * products[: last + 1] / both)
         worst = np.maximum(worst, np.maximum(found, 0.0))
     return worst
 
 
 def find_transient(y: Array, period: int) -> int:
-    """Return the samples of the first whole periods in which the outputs have not settled.
+    """Number of samples in the first whole periods in which the outputs have not settled.
 
     These are the periods, from the first on, that differ from the next one by more than the last
-    two from each other. Of two periods the end of their difference is taken for noise. The last
-    whole period never counts. Shape of y: (T, ny) or (T,).
+    two from each other. If there are only two periods, the end of their difference is taken for
+    noise. The last whole period never counts. Shape of y: (T, ny) or (T,).
     """
     y = y.reshape(len(y), -1)
     count = len(y) // period
     if count < 2:
         return 0
     periods = y[: count * period].reshape(count, period, -1)
-    # From the next one, not from the last: a drift is no transient.
+    # Difference from the next period, not from the last: a drift is no transient.
     difference = np.diff(periods, axis=0) ** 2  # (count - 1, period, ny)
     size = difference.mean(axis=1)
     noise = size[-1] if count > 2 else difference[0, -(period // _TAIL) - 1 :].mean(axis=0)

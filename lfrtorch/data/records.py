@@ -21,8 +21,11 @@ from lfrtorch._support.types import Array, Booleans
 
 Start = Literal["zero", "given", "estimated", "periodic", "measured"]
 
-_SMALLEST, _LARGEST = 1e-100, 1e100
-"""Levels of a signal, and sampling frequencies, whose squares neither overflow nor vanish."""
+_SMALLEST = 1e-100
+"""Least level of a signal, and sampling frequency, whose square does not vanish."""
+
+_LARGEST = 1e100
+"""Largest level of a signal, and sampling frequency, whose square does not overflow."""
 
 PAST_OUTPUTS = "a prediction from past outputs (noise=innovation or both)"  # in messages
 
@@ -51,15 +54,15 @@ def described_channels(entries: Any) -> tuple[Channel, ...]:
 
 
 def common_unit(channels: Sequence[Channel]) -> str:
-    """Return the unit of all channels, empty if they differ."""
+    """Return the common unit of all channels; empty if they differ."""
     units = {channel.unit for channel in channels}
     return units.pop() if len(units) == 1 else ""
 
 
 def of_one_unit(channels: Sequence[Channel]) -> bool:
-    """Return whether all channels have one unit: errors of several have no sum but a relative one.
+    """Tell if all channels have one unit; errors in different units only add up as relative ones.
 
-    A channel without a unit has another one than a channel with one.
+    A channel without a unit differs from a channel with one.
     """
     return len({channel.unit for channel in channels}) == 1
 
@@ -72,32 +75,34 @@ class Record:
         u, y: input and output, physical units. A one-dimensional array is one channel.
         fs: sampling frequency in Hz.
         start: ``"zero"`` simulates from x = 0 (near rest at the input's offset), ``"given"`` from
-            ``x0``; ``"estimated"`` fits the start state, too: in a fit together with the
-            parameters; in a simulation to the skipped samples alone, or to all if none is skipped;
-            ``"measured"`` takes the states from the first output, which tells them, and states
-            that it does not tell are at rest; ``"periodic"``: the record is a whole number of
-            periods in steady state.
-        skip: samples at the beginning that are left out of cost and score. Of an estimated start
-            without it, a score leaves out the first 50, or the first fifth of a shorter record.
+            ``x0``. ``"estimated"`` fits the initial state, too: in a fit together with the
+            parameters; in a simulation to the skipped samples alone, or to all if none is skipped.
+            ``"measured"`` computes the states from the first output; states that it does not
+            determine are at rest. ``"periodic"``: the record is a whole number of periods in steady
+            state.
+        skip: samples at the beginning that are left out of cost and score. Default for an estimated
+            start: a score leaves out the first 50, or the first fifth of a shorter record.
         x0: the given start state, in the coordinates of the model.
-        weight: of the squared normalised errors in a fit, one number or one for each output.
-        line_weight: of the squared errors in a fit by spectral line, for whole periods without
-            ``skip``: line f is that of ``numpy.fft.rfft``. 1 for all lines is plain least squares;
-            1 / noise variance is maximum likelihood (Pintelon and Schoukens, 2012, chapter 9).
+        weight: factor of the squared normalised errors in a fit, one number or one for each output.
+        line_weight: factors of the squared errors in a fit by spectral line, for whole periods
+            without ``skip``: line f is that of ``numpy.fft.rfft``. 1 for all lines is plain least
+            squares; 1 / noise variance is maximum likelihood (Pintelon and Schoukens, 2012,
+            chapter 9).
         limits: least and greatest output that the sensors show, each a number for all outputs or
-            one for each, or ``None``. At a limit the output is there or beyond: a fit counts the
-            error on the inner side alone, an estimated start state leaves the sample out, and a
-            simulation of the record ends there.
-        source: where it comes from: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
+            one for each, or ``None``. A sample at a limit means that the output is there or beyond:
+            a fit counts the error on the inner side alone, and an estimated start leaves the sample
+            out. A simulation of the record is clipped there.
+        source: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``, the origin.
         inputs, outputs: channel names and units, one a column of ``u`` and ``y``.
         period: samples of one period of the input, if it repeats; a ``"periodic"`` record holds
             a whole number of them. Default: one.
-        reference: what the experimenter sets if a controller makes the input, or what a generator
-            plays if the input is measured with noise: a channel for each input, without noise. Best
-            linear approximations are estimated from it, see :func:`lfrtorch.estimate_frf`.
-        valid: which output samples are measurements: False for outliers and dropouts. The model is
-            simulated through them; they are neither fitted nor scored. ``y`` may be NaN there, and
-            is interpolated, for figures and for first guesses. Default: all.
+        reference: noise-free signal of each input, known to the experimenter: the setpoint where a
+            controller makes the input, the generator's signal where the input is measured with
+            noise. Best linear approximations are estimated from it, see
+            :func:`lfrtorch.estimate_frf`.
+        valid: mask of the output samples that are measurements: False for outliers and dropouts.
+            The model is simulated through them; they are neither fitted nor scored. ``y`` may be
+            NaN there, and is interpolated, for figures and for first guesses. Default: all.
 
     Shape:
         u: (T, nu), y: (T, ny), reference: (T, nu), x0: (nx,), weight: () or (ny,),
@@ -221,7 +226,7 @@ class Record:
         return cls(u, y, rate, **given, **{"valid": valid, **options})
 
     def _measured(self) -> ArrayLike:
-        """The output, interpolated where it is not valid."""
+        """Output, interpolated where it is not valid."""
         if self.valid is None:
             return self.y
         what = f"record '{self.name}': valid"
@@ -239,7 +244,7 @@ class Record:
         return interpolated(y, valid)
 
     def _check_valid(self) -> None:
-        """Refuse what samples that are left out cannot go with."""
+        """Refuse settings that need every sample to be valid."""
         if self.valid is None:
             return
         if self.start == "periodic" or self.line_weight is not None:
@@ -344,31 +349,31 @@ class Record:
 
     @property
     def is_valid(self) -> Booleans:
-        """Which outputs (T, ny) are measurements."""
+        """Mask (T, ny) of the outputs that are measurements."""
         return np.ones(self.y.shape, dtype=bool) if self.valid is None else self.valid
 
     @property
     def scored(self) -> Booleans:
-        """Which outputs (T, ny) count: valid ones after the skipped samples."""
+        """Mask (T, ny) of the outputs that count: valid ones after the skipped samples."""
         return self.is_valid & (np.arange(len(self.y))[:, None] >= self.skip)
 
     @property
     def scored_samples(self) -> int:
-        """Samples of which an output counts."""
+        """Number of samples at which an output counts."""
         return int(self.scored.any(axis=1).sum())
 
     @property
     def factors(self) -> Array:
-        """What the errors (T, ny) are multiplied by in a fit: √weight, 0 if not scored."""
+        """Factors of the errors (T, ny) in a fit: √weight, 0 if not scored."""
         return np.sqrt(self.weight) * self.scored
 
     def errors(self, y_hat: Array) -> Array:
-        """y - y_hat after the skipped samples (T - skip, ny), 0 where y is not valid."""
+        """Errors y - y_hat after the skipped samples (T - skip, ny), 0 where y is not valid."""
         found = (self.y - y_hat)[self.skip :]
         return found if self.valid is None else np.where(self.valid[self.skip :], found, 0.0)
 
     def require_all_valid(self, what: str) -> None:
-        """Refuse what needs every output sample, with a ValueError that says what it is."""
+        """Refuse samples that are not valid with a ValueError: ``what`` needs all of them."""
         if self.valid is not None:
             raise InputError(
                 f"record '{self.name}' has {(~self.valid).sum()} output sample(s) that are not "
@@ -377,7 +382,7 @@ class Record:
 
     @property
     def start_factors(self) -> Array:
-        """The same for an estimated start of a given model: √weight, 0 in the scored samples."""
+        """Factors of the errors for an estimated start of a given model: √weight, 0 if scored."""
         counts = self.is_valid & (self.beyond == 0)
         if self.skip:
             counts = counts & (np.arange(len(self.y))[:, None] < self.skip)
@@ -385,14 +390,14 @@ class Record:
 
     @property
     def beyond(self) -> Array:
-        """Which way the output (T, ny) may be beyond a limit: 1 up, -1 down, 0 if it is inside."""
+        """Direction in which the output (T, ny) may be beyond a limit: 1 up, -1 down, 0 inside."""
         if self.limits is None:
             return np.zeros(self.y.shape)
         low, high = np.asarray(self.limits)
         return (self.y >= high) * 1.0 - (self.y <= low)
 
     def shown(self, y: Array) -> Array:
-        """An output (T, ny) as the sensors show it: no further than the limits."""
+        """Clip an output (T, ny) to the limits of the sensors."""
         return y if self.limits is None else np.clip(y, *np.asarray(self.limits))
 
     @property
@@ -401,7 +406,7 @@ class Record:
         return len(self.u)
 
     def __getitem__(self, window: slice) -> Record:
-        """Return the part of the record in ``window``, from zero state with nothing skipped.
+        """Return the part of the record in ``window``, with start ``"zero"`` and nothing skipped.
 
         A part of a record whose start is measured has a measured start, too.
         """
@@ -427,7 +432,7 @@ class Record:
         period: int | None,
         **others: Any,
     ) -> Record:
-        """Return some samples of the record, and how they begin; ``others`` are other fields."""
+        """Return some samples of the record with their start; ``others`` are other fields."""
         return self.with_signals(
             **self.signals_in(window), limits=self.limits, start=start, skip=skip, period=period,
             **others,
@@ -448,7 +453,7 @@ class Record:
     ) -> Record:
         """Return a record of the same kind with other signals; ``others`` are other fields.
 
-        A call names all that depends on the signals, so that none of it stays by mistake.
+        A call names every field that depends on the signals, so that none stays by mistake.
         """
         return replace(
             self, u=u, y=y, reference=reference, valid=valid, limits=limits, start=start, skip=skip,
@@ -458,8 +463,8 @@ class Record:
     def mean_period(self) -> Record:
         """Return one period, the mean of all P of a record in steady state, with their weight.
 
-        A fit of simulations is the same if the input has no noise, and faster. If it has, the mean
-        has 1 / P of its power, and a model 1 / P of the bias.
+        A fit of the simulation error gives the same model if the input has no noise, and is faster.
+        Noise of the input keeps 1 / P of its power in the mean, and 1 / P of its bias in a model.
 
         Example:
             >>> from dataclasses import replace
@@ -486,7 +491,7 @@ class Record:
         )  # fmt: skip
 
     def joined(self, other: Record) -> Record:
-        """Return the record, and behind it what another one that goes on from it scores."""
+        """Append the scored samples of another record that continues this one."""
         here, there = (
             record.signals_in(slice(first, None)) | {"valid": record.is_valid[first:]}
             for record, first in ((self, 0), (other, other.skip))
@@ -515,13 +520,13 @@ def interpolated(y: Array, valid: Booleans) -> Array:
 
 
 def measured_signals(record: Record) -> Array:
-    """Inputs, which outputs are measurements, and these (T, nu + 2 ny); 0 for the others."""
+    """Inputs, masks of the outputs and valid outputs (T, nu + 2 ny); 0 for outputs not valid."""
     valid = record.is_valid
     return np.hstack([record.u, valid.astype(np.float64), np.where(valid, record.y, 0.0)])
 
 
 def signals(record: Record) -> str:
-    """Write the channels of a record: u -> y."""
+    """Name the channels of a record: u -> y."""
 
     def listed(channels: Sequence[Channel]) -> str:
         return ", ".join([*map(str, channels[:4]), *["..."] * (len(channels) > 4)])
@@ -530,7 +535,7 @@ def signals(record: Record) -> str:
 
 
 def with_past_outputs(record: Record) -> Record:
-    """Make the record of a one-step predictor: its inputs are u, then y, and its output is y.
+    """Return the record of a one-step predictor: its inputs are u, then y, and its output is y.
 
     A record in steady state has an estimated start: its noise does not repeat.
     """
@@ -547,7 +552,7 @@ def with_past_outputs(record: Record) -> Record:
 
 
 def as_records(records: Record | Sequence[Record]) -> list[Record]:
-    """List one record or several, checked to share channels and sampling frequency."""
+    """List one record or several; refuse different channels and sampling frequencies."""
     if not isinstance(records, Record | Iterable):
         raise _no_record(records)
     found = [records] if isinstance(records, Record) else list(records)
@@ -581,7 +586,7 @@ def _no_record(given: object) -> ValueError:
 
 
 def without_coordinates(record: Record) -> Record:
-    """Return a record whose given start state, in the coordinates of one model, is estimated."""
+    """Replace a given start state, in the coordinates of one model, by an estimated one."""
     return replace(record, start="estimated", x0=None) if record.start == "given" else record
 
 
@@ -591,7 +596,7 @@ class NormalisedRecord:
 
     Args:
         u, y: normalised input (T, nu) and output (T, ny); a predictor's input has y as well.
-        record: how it starts, and how its errors count.
+        record: the record itself, with its start and weights.
         limits: least and greatest output (2, ny), normalised.
     """
 
@@ -623,7 +628,7 @@ class Scaler:
 
     @classmethod
     def of(cls, records: Sequence[Record], *, offset: bool = True) -> Scaler:
-        """The means of the records' signals, or 0 without ``offset``, and the rms about them."""
+        """Scaler from the means of the records, or 0 without ``offset``, and the rms about them."""
         us, ys = [r.u for r in records], [r.y for r in records]
 
         def centre(signals: list[Array]) -> Array:
@@ -635,22 +640,22 @@ class Scaler:
         return cls(u_offset, rms_scale(us, u_offset), y_offset, rms_scale(ys, y_offset))
 
     def normalise(self, record: Record) -> NormalisedRecord:
-        """The record from physical to normalised units."""
+        """Normalise a record in physical units."""
         limits = None if record.limits is None else self.normalise_y(np.asarray(record.limits))
         return NormalisedRecord(
             self.normalise_u(record.u), self.normalise_y(record.y), record, limits
         )
 
     def normalise_u(self, u: Array) -> Array:
-        """Input (T, nu) from physical to normalised units."""
+        """Normalise an input (T, nu) in physical units."""
         return (u - self.u_offset) / self.u_scale
 
     def normalise_y(self, y: Array) -> Array:
-        """Output (T, ny) from physical to normalised units."""
+        """Normalise an output (T, ny) in physical units."""
         return (y - self.y_offset) / self.y_scale
 
     def restore_y(self, y: Array) -> Array:
-        """Output (T, ny) from normalised to physical units; infinite where it is too large."""
+        """Restore the physical units of an output (T, ny); infinite where it is too large."""
         with np.errstate(over="ignore"):  # of a simulation that diverges
             return y * self.y_scale + self.y_offset
 
@@ -691,7 +696,7 @@ def _side(
 
 
 def check_largest(what: str, largest: float) -> None:
-    """Refuse a signal whose largest value has a square that is no number, or is 0."""
+    """Refuse a signal whose largest square overflows or vanishes."""
     if largest > _LARGEST or 0 < largest < _SMALLEST:
         raise InputError(
             f"{what} goes up to {largest:g}; give it in a unit that brings it between "
@@ -707,7 +712,7 @@ def check_rate(what: str, fs: float) -> None:
 
 
 def _channels(given: Any, what: str) -> tuple[Channel, ...]:
-    """Channels, also of names alone."""
+    """Channels from channels, or from names alone."""
     listed = isinstance(given, list | tuple)
     pairs = [(c,) if isinstance(c, str) else c for c in given] if listed else []
     known = [

@@ -35,13 +35,13 @@ from lfrtorch.datasets import official
 
 __all__ = ["load", "multisine", "simulate", "sweep"]
 
-# Parameters of the published system, SI units.
+# Parameters of the published system, in SI units.
 _M, _C, _K = 2.0, 10.0, 5e4
 _ALPHA, _BETA, _GAMMA, _DELTA = 5e4, 1e3, 0.8, -1.1
 
 _FS = 750.0  # Hz, of the records
 _RATIO = 20  # integration rate over _FS
-_TAPS = 31  # of each low-pass filter
+_TAPS = 31  # length of each low-pass filter
 
 _BAND = (5.0, 150.0)  # Hz, of the multisines
 _PERIOD = 8192  # samples at 750 Hz, of the multisine test
@@ -65,26 +65,27 @@ def load(
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
-    """Simulated estimation data, and the official tests if their files are at hand.
+    """Simulated estimation data, and the official tests if their files exist.
 
     Training, validation and selection are steady-state periods of multisine realisations, with
-    measurement noise: validation at the level of the first training record, selection at levels of
-    its own. (Starts that do alike at the training's level differ by a factor of 2 at small
+    measurement noise: validation at the level of the first training record, selection at other
+    levels. (Starts that are equally good at the training level differ by a factor of 2 at small
     amplitudes, and on the sweep.) The tests are noise free: ``"multisine"`` is one steady-state
     period and ``"sweep"`` starts from rest, its first 2000 samples unscored. A test without its
     files is simulated: the sweep is the official one up to rounding, the multisine is another
-    realisation of the official kind (drawn from ``seed + 2000``). ``Record.source`` says which.
+    realisation of the official kind (drawn from ``seed + 2000``). ``Record.source`` names the
+    origin.
 
     Args:
-        seed: of the training realisation and its noise.
+        seed: seed of the training realisation and its noise.
         validation_seed_offset: added to ``seed`` for the validation realisation; those of the
             selection follow.
-        samples: of one estimation period, at 750 Hz.
-        rms: of the training input, N; of several, a realisation each.
-        selection_rms: of the selection inputs, N.
-        noise_rms: of the measurement noise before the decimation, m; the low-pass filters leave
+        samples: samples of one estimation period, at 750 Hz.
+        rms: rms of the training input, N; several levels are a realisation each.
+        selection_rms: rms of the selection inputs, N.
+        noise_rms: rms of the measurement noise before the decimation, m; the low-pass filters leave
             0.92 of it: 7.35e-6 m of the official 8e-6 m.
-        download: whether missing test files are downloaded, by the package nonlinear_benchmarks.
+        download: download missing test files, by the package nonlinear_benchmarks.
         root: folder that holds ``BoucWen/BoucWenFiles/...`` as the package nonlinear_benchmarks
             lays it out; by default that package's cache folder, if there is one.
 
@@ -142,15 +143,15 @@ def load(
 def multisine(
     *, samples: int = _PERIOD, rms: float = 50.0, seed: int | np.random.Generator = 0
 ) -> Array:
-    """One period of the official random-phase multisine at 15 kHz: full grid, 5 Hz to 150 Hz.
+    """Period of the official random-phase multisine at 15 kHz: full grid, 5 Hz to 150 Hz.
 
     Lines floor(5 / f0) to ceil(150 / f0), f0 = 750 / samples Hz, of equal magnitude and uniform
     phase. Every 20th sample, ``multisine(...)[::20]``, is the input of a record.
 
     Args:
-        samples: of the period at 750 Hz, 150 or more.
+        samples: samples of the period at 750 Hz, 150 or more.
         rms: standard deviation, N.
-        seed: of the phases, or a generator to draw them from.
+        seed: seed of the phases, or a generator to draw them from.
 
     Shape:
         (20 samples,), N.
@@ -176,7 +177,7 @@ def multisine(
     spectrum = np.zeros(samples * _RATIO // 2 + 1, complex)
     spectrum[lines] = np.exp(1j * phase)
     u = np.fft.irfft(spectrum, samples * _RATIO)
-    return rms * u / np.std(u, ddof=1)  # ddof: the official files have it
+    return rms * u / np.std(u, ddof=1)  # ddof as in the official files
 
 
 def sweep() -> Array:
@@ -207,10 +208,10 @@ def simulate(
 
     Args:
         u: force at 15 kHz.
-        factors: of the successive decimations, 20 together: the estimation data and the multisine
+        factors: successive decimations, 20 together: the estimation data and the multisine
             test use (2, 2, 5), the sweep test (20,).
-        noise_rms: of Gaussian noise in 0 to 375 Hz, m, added before the decimation.
-        seed: of the noise, or a generator to draw it from.
+        noise_rms: rms of Gaussian noise in 0 to 375 Hz, m, added before the decimation.
+        seed: seed of the noise, or a generator to draw it from.
 
     Shape:
         u: (T,), N, T a multiple of 20. Returns: (T / 20,), m.
@@ -260,14 +261,14 @@ def _newmark(u: Array) -> Array:
     Newmark (1/2, 1/4), with the trapezoidal rule for z. The balance of forces is linear in the
     acceleration a, so that a step is one equation in the rate s = z', solved by Newton.
     """
-    half = 1 / (_RATIO * _FS) / 2  # s, of a step
+    half = 1 / (_RATIO * _FS) / 2  # length of a step, s
     inertia = _M + half * _C + half**2 * _K
     out = np.full(u.size, np.nan)
     y = v = z = s = 0.0
     a = u[0] / _M
     out[0] = y
     for i in range(1, u.size):
-        # Without the new rates, which add half**2 a to y, half a to v and half s to z.
+        # Prediction without the new rates, which add half**2 a to y, half a to v and half s to z.
         y_last = y + 2 * half * v + half**2 * a
         v_last = v + half * a
         z_last = z + half * s
@@ -302,7 +303,7 @@ def _decimate(x: Array, factor: int) -> Array:
 
 
 def _levels(name: str, given: float | Sequence[float]) -> list[float]:
-    """One level, or several or none, in N."""
+    """List one level, several or none, in N."""
     levels = list(given) if isinstance(given, Sequence) else [given]
     for level in levels:
         number(name, level, positive=True)
@@ -327,7 +328,7 @@ def _realisation(
 
 
 def _tests(folder: Path, seed: int) -> list[Record]:
-    """The multisine and the sweep; simulated if their files are not there."""
+    """Tests multisine and sweep; simulated without their files."""
     found = _read_official(folder, "multisine")
     if found is None:
         multisine = _realisation("multisine", seed, samples=_PERIOD, rms=50.0, noise_rms=0.0)
@@ -345,7 +346,7 @@ def _record(u: Array, y: Array, **kwargs: Any) -> Record:
 
 
 def _official_folder(root: str | Path | None, download: bool) -> Path:
-    """Folder of the official test files; below a ``root`` that is given there must be some."""
+    """Folder of the official test files, which must exist below a given ``root``."""
     if download:
         first = f"{_FILES}/uval_multisine.mat"
         return official.find(root, first, _LOADER, download=True).parent
@@ -366,7 +367,7 @@ def _pair(folder: Path, test: str) -> list[Path]:
 
 
 def _read_official(folder: Path, test: str) -> tuple[Array, Array] | None:
-    """Input (N) and output (m) of a test, (samples,) each; ``None`` if neither file is there."""
+    """Read input (N) and output (m) of a test, (samples,) each; ``None`` if neither file exists."""
     paths = _pair(folder, test)
     missing = [path for path in paths if not path.is_file()]
     if missing == paths:

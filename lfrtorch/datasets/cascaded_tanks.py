@@ -1,10 +1,10 @@
 """Cascaded tanks benchmark: water levels with overflow, official split.
 
-Input u (V), of the pump that fills the upper tank; output y (V), the level of the lower one, which
-the upper one drains into. An estimation and a test record of 1024 samples each, 4 s apart. The
-outflow goes as the root of the level. At large inputs the upper tank overflows, partly into the
-lower one, and the sensor of the lower one ends at 10 V (48 estimation samples): a limit of the
-records.
+The input u (V) drives the pump that fills the upper tank. The output y (V) is the level of the
+lower tank, into which the upper one drains. Estimation and test have 1024 samples each, 4 s apart.
+The outflow is proportional to the root of the level. At large inputs the upper tank overflows,
+partly into the lower one, and the sensor of the lower one saturates at 10 V (48 estimation
+samples): a limit of the records.
 
 The records do not begin at rest, and their start states are unknown; the benchmark says that they
 are the same. Older versions of the package nonlinear_benchmarks left 5 samples of the test
@@ -31,9 +31,9 @@ __all__ = ["load"]
 
 _FILE = "Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat"
 _FS = 0.25  # Hz
-_SAMPLES = 1024  # of each record
-_MOST = 10.0  # V, of the sensor
-_WINDOW = 50  # samples that the package leaves unscored
+_SAMPLES = 1024  # samples of each record
+_MOST = 10.0  # saturation of the sensor, V
+_WINDOW = 50  # samples that nonlinear_benchmarks leaves unscored
 
 
 def load(
@@ -44,18 +44,18 @@ def load(
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
-    """The estimation record, whole or cut in time for training and validation, and the test record.
+    """Estimation record, whole or cut in time for training and validation, and the test record.
 
     Training estimates its start states with the parameters. A validation record is the estimation
     record up to the last sample that validates: the samples before the first one, which it skips,
     give its start state. The start state of the test is fitted to its first ``skip`` samples.
 
     Args:
-        validation: fraction of the estimation samples that validate; 0: all of them train, as each
-            of the two overflows and the only inputs below 1.2 V (the last quarter's) are wanted.
-        first: the first of them, counted from 0; what is before and what is after trains.
+        validation: fraction of the estimation samples that validate. With 0 all of them train, so
+            that both overflows and the only inputs below 1.2 V (in the last quarter) are fitted.
+        first: first validation sample, counted from 0; samples before and after them train.
         skip: samples at the beginning of the test that are not scored.
-        download: whether a missing file is downloaded.
+        download: download a missing file.
         root: folder that holds ``Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat``.
 
     Shape:

@@ -1,13 +1,13 @@
 """Coupled electric drives (CED): measurements of two motors that drive a pulley by a flexible belt.
 
-Input u (V, the two motors together), output z (ticks/s, the speed of the pulley), 500 samples at
-50 Hz in each of two measurements: u12, z12 is louder, its input u11 + 0.5 V. Of each
-the first 400 samples are for estimation and the last 100 for the test, whose first 10 the score
-leaves out and a model may look at to start (4 in older versions of the package
-nonlinear_benchmarks, and of scores that were published with them).
+The input u (V) drives both motors, the output z (ticks/s) is the speed of the pulley: 500 samples
+at 50 Hz in each of two measurements. u12, z12 is louder: its input is u11 + 0.5 V. The first 400
+samples of each are for estimation and the last 100 for the test. The score leaves out the first 10
+samples of the test, to which a model may fit its start state (4 in older versions of the package
+nonlinear_benchmarks, and in scores that were published with them).
 
-The pulse counter is blind to the sign of the speed: z is its absolute value, an even function. The
-pulley hangs on a spring, which makes for a lightly damped mode.
+The pulse counter does not see the sign of the speed: z is its absolute value, an even function. The
+pulley hangs on a spring, which gives a lightly damped mode.
 
 The archive is FULLTEXT01.zip, or CoupledElectricDrivesDataSetAndReferenceModels.zip in older
 versions of nonlinear_benchmarks; its PRBS measurements, DATAPRBS.MAT, are no part of the benchmark.
@@ -33,27 +33,26 @@ _ARCHIVES = ("CED/FULLTEXT01.zip", "CED/CoupledElectricDrivesDataSetAndReference
 _FS = 50.0  # Hz
 _SAMPLES, _ESTIMATION = 500, 400
 _WINDOW = 10  # samples, unscored, of the tests
-_SITE = "_site"  # at the end of the name of a test as the site cuts it
+_SITE = "_site"  # ending of the name of a test that is cut as on the site
 _LEVELS = {"low": ("u11", "z11"), "high": ("u12", "z12")}
 
 
 def load(
     *, validation: float = 0.2, download: bool = False, root: str | Path | None = None
 ) -> Dataset:
-    """Both measurements, each cut in time into a training, a validation and a test record.
+    """Records of both measurements, each cut in time into training, validation and test.
 
     The tests score the same samples twice. ``"low_site"`` and ``"high_site"`` are what the site
     nonlinearbenchmark.org gives: the start state is fitted to the 10 outputs that are not scored.
     Validation and the tests ``"low"`` and ``"high"`` are simulated from the beginning of their
-    measurement: all that comes before their scored samples is warm-up. Whether a measurement begins
-    at rest is not known. So all records have an estimated start: training fits it with the
-    parameters, and in validation and these tests it is fitted to the warm-up: hundreds of samples
-    of known inputs decide the state better than 10 outputs, which hide the sign of the speed.
+    measurement: all samples before the scored ones are warm-up. The measurements may not begin at
+    rest. So all records have an estimated start: training fits it with the parameters, validation
+    and these tests fit it to the warm-up. Hundreds of samples with known inputs determine the state
+    better than 10 outputs, which hide the sign of the speed.
 
     Args:
-        validation: fraction of the estimation samples of each measurement, the last of them, that
-            validate.
-        download: whether a missing file is downloaded.
+        validation: last fraction of the estimation samples of each measurement, which validates.
+        download: download a missing file.
         root: folder that holds ``CED/DATAUNIF.MAT``, or ``CED/FULLTEXT01.zip`` with the file in it.
 
     Shape:

@@ -1,17 +1,17 @@
 """Electro-mechanical positioning system (EMPS): measurements of a drive of a linear axis.
 
-Input vir (V, the controller's output to the motor), output qm (m, the position), 24841 samples at
-1 kHz in each of two files: DATA_EMPS.mat is for estimation, DATA_EMPS_PULSES.mat, where pulses act
-on top of the motion, for the test, whose first 20 samples the score leaves out. Scores are in
-metres here and published in millimetres.
+The input vir (V) is the controller's output to the motor, the output qm (m) the position. Each of
+two files has 24841 samples at 1 kHz. DATA_EMPS.mat is for estimation. DATA_EMPS_PULSES.mat, in
+which pulses act in addition to the motion, is for the test, whose first 20 samples are not scored.
+Scores are in metres here and published in millimetres.
 
 A force moves a mass against viscous and dry friction: from the force to the position the system
 integrates, the friction is the nonlinearity, and both measurements are under the feedback of a
 position controller (its reference qg and the times t are in the files, too, and not read).
 
-The input vir is a voltage; the scripts of those who measured make a force of it by the drive gain
-gtau (N/V) in the files, which a model's scores do not depend on. The pulses of the test file
-(pulses_N) are no input in those scripts, nor here. The data are qm as it stands, in metres.
+The input vir is a voltage; the authors' scripts convert it to a force by the drive gain gtau (N/V)
+in the files, which does not change the scores of a model. The pulses of the test file (pulses_N)
+are no input in those scripts, nor here. The output is qm as stored, in metres.
 
 References:
     A. Janot, M. Gautier, M. Brunot (2019), "Data set and reference models of EMPS", Workshop on
@@ -34,7 +34,7 @@ __all__ = ["load"]
 _ESTIMATION, _TEST = "EMPS/DATA_EMPS.mat", "EMPS/DATA_EMPS_PULSES.mat"
 _ARCHIVE = "EMPS/EMPS.zip"
 _FS = 1000.0  # Hz
-_SAMPLES = 24_841  # of each file
+_SAMPLES = 24_841  # samples of each file
 _WINDOW = 20  # samples, unscored, of the test
 
 
@@ -45,20 +45,20 @@ def load(
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
-    """The estimation measurement, cut in time into training and validation, and the test record.
+    """Estimation measurement, cut in time into training and validation, and the test record.
 
-    All start states are estimated. An integrator never forgets where it started: the error that a
-    zero state makes in the position stays for good, and no warm-up from zero state would end it.
-    Training fits the start with the parameters; in validation and test it is fitted to the first
-    samples, which are not scored. Those of the validation record are the last ones of training.
+    All start states are estimated. An integrator never forgets its initial state: the position
+    error of a zero state is permanent, and no warm-up from zero state would remove it. Training
+    fits the start with the parameters; in validation and test it is fitted to the first samples,
+    which are not scored. Those of the validation record are the last ones of training.
 
     Args:
-        validation: fraction of the estimation samples, the last of them, that validate. With 0 all
-            train, and random starts are judged on them as the test is scored: from a start state
-            that is fitted to the first samples alone.
-        warm_up: first samples of the validation record, which its start state is fitted to and
-            which train, too; by default as many as the test has.
-        download: whether missing files are downloaded.
+        validation: last fraction of the estimation samples, which validates. With 0 all train, and
+            random starts are judged on them like the test: from a start state that is fitted to
+            the first samples alone.
+        warm_up: first samples of the validation record, to which its start state is fitted; they
+            train, too. Default: as many as the test has.
+        download: download missing files.
         root: folder that holds ``EMPS/DATA_EMPS.mat`` and ``EMPS/DATA_EMPS_PULSES.mat``, or
             ``EMPS/EMPS.zip`` with both in it.
 
@@ -104,7 +104,7 @@ def load(
 
 
 def _measured(path: Path, file: str) -> Record:
-    """One file, or the archive with it, as a record."""
+    """Read one file, or the archive with it, as a record."""
     shapes = {"vir": (_SAMPLES, 1), "qm": (_SAMPLES, 1)}
     u, y = official.read_arrays(path, shapes, Path(file).name).values()
     return official.record(u, y, {"vir": "V"}, {"qm": "m"}, fs=_FS)

@@ -13,9 +13,9 @@ and 7 are for estimation; 2, 4 and 6, whose files end in ``_Validation``, are th
   over periods lessens it.
 - The published scores are of the first acceleration alone. A score here pools the three outputs;
   ``rmse_by_output`` has each.
-- The window of 50 samples, 0.125 s, is no warm-up for modes that ring for seconds. The tests are
-  therefore simulated from rest at their first sample, where the input begins, and the transient of
-  a multisine's first period is scored.
+- The window of 50 samples, 0.125 s, is too short a warm-up for modes that ring for seconds. The
+  tests are therefore simulated from rest at their first sample, where the input begins, and the
+  transient of a multisine's first period is scored.
 - The swept sines (``SineSw``) of levels 1, 3 and 5 end in zeros that fill the file, up to 1500 of
   all channels. Training and validation leave them out; the tests are scored as they are.
 - The special odd multisines (``SpecialOddMSine``) are not used.
@@ -64,7 +64,7 @@ def load(
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
-    """Measurements to fit, whole records of others to choose by, and the six tests.
+    """Measurements for training, whole records of others for validation, and the six tests.
 
     A multisine that trains is the mean of the last 8 of its 9 periods, in steady state: noise, that
     of the force included, is lower by √8, and its squared errors have the weight 8. Swept sines,
@@ -74,9 +74,9 @@ def load(
     ``"sweep_4"`` and ``"sweep_6"``. If a test's file is missing, a note says so.
 
     Args:
-        train: what is fitted, ``"multisine_1"`` or ``"sweep_1"``, of the levels 1, 3, 5 and 7.
-        validation: what is chosen by, of the same; it may be empty.
-        download: whether files that are missing are downloaded (148 MB) by nonlinear_benchmarks.
+        train: measurements to fit, ``"multisine_1"`` or ``"sweep_1"``, at the levels 1, 3, 5 and 7.
+        validation: measurements for validation, of the same names; it may be empty.
+        download: download missing files (148 MB) by nonlinear_benchmarks.
         root: folder that holds ``F16/F16GVT_Files/BenchmarkData/F16Data_FullMSine_Level1.mat`` and
             so on.
 
@@ -99,7 +99,7 @@ def load(
     files = {name: _file(name, "_Validation") for name in names}
     found, notes = official.find_tests(root, files, "F16", download=download)
     tests = [_whole(path, name, name) for name, path in found.items()]
-    first = np.array([1.0, 0.0, 0.0])  # of the outputs
+    first = np.array([1.0, 0.0, 0.0])  # names of the outputs
     return Dataset(
         name="f16",
         train=fitted,
@@ -117,7 +117,7 @@ def _file(name: str, end: str = "") -> str:
 
 
 def _whole(path: Path, name: str, called: str) -> Record:
-    """A file, from rest."""
+    """Read a file as a record from rest."""
     period = _PERIOD if name.startswith("multisine") else None
     samples = None if period is None else _PERIODS * _PERIOD
     force = official.read_arrays(path, {"Force": (1, samples)})["Force"]
@@ -136,7 +136,7 @@ def _whole(path: Path, name: str, called: str) -> Record:
 
 
 def _measured(path: Path, name: str, called: str) -> Record:
-    """A file; a sweep up to where the first of its channels is filled up with zeros."""
+    """Read a file; a sweep ends where its first channel is filled up with zeros."""
     record = _whole(path, name, called)
     if record.period is not None:
         return record
@@ -148,14 +148,14 @@ def _measured(path: Path, name: str, called: str) -> Record:
 
 
 def _fitted(record: Record) -> Record:
-    """For training: of a multisine one period, the mean of those without transient."""
+    """Read a training record; a multisine becomes the mean of its periods without transient."""
     if record.period is None:
         return record
     return replace(record[_PERIOD:], start="periodic").mean_period()
 
 
 def _check(train: Sequence[str], validation: Sequence[str]) -> None:
-    """Refuse other names than those of estimation measurements, and any that stands twice."""
+    """Refuse names that are not estimation measurements, and repetitions."""
     known = [f"{kind}_{level}" for kind in _KINDS for level in _ESTIMATION]
     for option, given in (("train", train), ("validation", validation)):
         listed = isinstance(given, Sequence) and not isinstance(given, str)

@@ -6,9 +6,9 @@ in groups of three, with two periods of 8192 samples each: six realisations for 
 for the test. The hysteresis of the actuators is the nonlinearity, and the structure resonates.
 
 The score of a level is the mean over outputs, realisations and periods of the RMSE, without the
-first 100 samples of each period. A published model simulates each period as a record of its own,
-and its start is behind it by sample 100. Here a test is simulated in its own periodic steady state,
-from the inputs alone, which is what was measured; the same samples are scored.
+first 100 samples of each period. Published models simulate each period as a separate record, whose
+start has faded by sample 100. Here a test is simulated in periodic steady state, from the inputs
+alone, as it was measured; the same samples are scored.
 
 All data are in one file, in arrays (samples, channels, realisations, periods) for each level and
 use, ``u_100mV_train`` to ``y_300mV_test``. They are by M. Floren, CC BY 4.0.
@@ -51,7 +51,7 @@ def load(
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
-    """Realisations of several levels to fit, others to choose by, and the tests.
+    """Realisations of several levels for training, others for validation, and the tests.
 
     A training record is the mean of the two periods of a realisation, with the weight 2. Each
     period of a validation or test realisation is a record. Those of a level make one score,
@@ -62,12 +62,12 @@ def load(
     Without test arrays in the file there are no tests, and a note says so.
 
     Args:
-        levels: that train and validate, mV rms.
-        validation: how many realisations of each level, the last of them, validate; 0 for none.
-        mean: whether a training record is the mean of the periods; if not, it has them one after
-            the other, and their difference shows the noise.
-        download: whether a missing file is downloaded, by a package nonlinear_benchmarks that has
-            this benchmark (version 1.0.1 has not).
+        levels: levels of training and validation, mV rms.
+        validation: number of last realisations of each level that validate; 0 for none.
+        mean: a training record is the mean of the periods; otherwise it has them one after the
+            other, and their difference shows the noise.
+        download: download a missing file, by a package nonlinear_benchmarks that has this
+            benchmark (version 1.0.1 does not).
         root: folder that holds ``FineSteeringMirror/combined_data.npz``.
 
     Shape:
@@ -83,7 +83,7 @@ def load(
     arrays = official.read_npz(path)
 
     def pair(level: int, use: str) -> tuple[Array, Array]:
-        """u and y (samples, channels, realisations, periods)."""
+        """Arrays u and y (samples, channels, realisations, periods)."""
         u, y = (arrays.get(f"{name}_{level}mV_{use}", np.zeros(0)) for name in "uy")
         if u.ndim != 4 or u.shape != y.shape or u.shape[1] != _CHANNELS or len(u) <= _WINDOW:
             raise InputError(
@@ -140,7 +140,7 @@ def load(
 
 
 def _record(name: str, u: Array, y: Array, *, period: int, skip: int = 0) -> Record:
-    """Whole periods in steady state."""
+    """Record of whole periods in steady state."""
     inputs, outputs = (
         {f"{letter}{i + 1}": unit for i in range(_CHANNELS)} for letter, unit in ("uV", "ym")
     )
@@ -150,7 +150,7 @@ def _record(name: str, u: Array, y: Array, *, period: int, skip: int = 0) -> Rec
 
 
 def _each(name: str, u: Array, y: Array, realisations: Iterable[int]) -> list[Record]:
-    """Each period of some realisations."""
+    """Records of each period of some realisations."""
     return [
         _record(
             f"{name}_{r + 1}_{p + 1}",

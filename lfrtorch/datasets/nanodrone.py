@@ -5,15 +5,16 @@ frame of the room, roll, pitch and yaw (rad) and the body's rates (rad/s), at 10
 inputs and outputs of the same instant; the inputs of a row act on the outputs of the next one. The
 first inputs of a flight are missing: the second ones take their place. Angles are unwrapped.
 
-From each output on, the outputs 1 to 50 samples ahead are predicted from the inputs. Scores are the
-sums over these 50 samples of the mean error: Euclidean for position, velocity and rates, the angle
-between the two attitudes for the third.
+The outputs 1 to 50 samples ahead of each sample are predicted from the inputs. A score is the sum
+over these 50 samples of the mean error: Euclidean for position, velocity and rates, the angle
+between the two attitudes for the attitude.
 
 Four flights each of three kinds, squares, chirps and random ones, are for estimation, three of a
-fourth kind, melon, for the test. Files are those of the release, ``train/chirp_20251017_run1.csv``
-and so on, with quaternions for the attitude, or ``train_chirp_run1.npz`` with arrays u (N, 4) and
-y (N, 12) and the sampling frequency fs. The reader of CSV files was made after the description of
-the release and tried on files of that form, not on the release itself.
+fourth kind, melon, for the test. The files are those of the release,
+``train/chirp_20251017_run1.csv`` and so on, with quaternions for the attitude, or
+``train_chirp_run1.npz`` with arrays u (N, 4) and y (N, 12) and the sampling frequency fs. The
+reader of CSV files follows the description of the release; it was tested on files of that form, not
+on the release itself.
 
 A submission to the site is the four sums of ``melon``, the means of its flights.
 
@@ -45,14 +46,14 @@ if TYPE_CHECKING:
 __all__ = ["load"]
 
 _FOLDER = "nanodrone"
-_KINDS = ("chirp", "random", "square")  # of flights for estimation
-_TEST = "melon"  # the kind of the test's
+_KINDS = ("chirp", "random", "square")  # kinds of flights for estimation
+_TEST = "melon"  # kind of the test flights
 _HOLDS = {
     ".npz": "arrays u, y and fs",
     ".csv": "columns t, x, y, z, qx to qw, vx to vz, wx to wz and m1_rads to m4_rads",
 }
 HORIZON = 50
-"""Samples ahead that are scored."""
+"""Number of predicted samples that are scored."""
 
 INPUTS = tuple(Channel(f"motor{i}", "rad/s") for i in range(1, 5))
 OUTPUTS = tuple(
@@ -69,7 +70,7 @@ _ANGLES = slice(6, 9)
 
 
 def _euclidean(first: int) -> Callable[[Array, Array], Array]:
-    """The error of three outputs from the first on."""
+    """Euclidean error of three outputs from ``first`` on."""
 
     def error(y_hat: Float[Array, "n h 12"], y: Float[Array, "n h 12"]) -> Float[Array, "n h"]:
         return np.linalg.norm((y_hat - y)[..., first : first + 3], axis=-1)
@@ -78,7 +79,7 @@ def _euclidean(first: int) -> Callable[[Array, Array], Array]:
 
 
 def _geodesic(y_hat: Float[Array, "n h 12"], y: Float[Array, "n h 12"]) -> Float[Array, "n h"]:
-    """The angle of the rotation between two attitudes, rad."""
+    """Angle of the rotation between two attitudes, rad."""
 
     def attitude(signal: Array) -> Rotation:
         angles = signal[..., _ANGLES].reshape(-1, 3)
@@ -94,23 +95,23 @@ MEASURES = {
     "position": _euclidean(0), "velocity": _euclidean(3), "attitude": _geodesic,
     "rates": _euclidean(9),
 }  # fmt: skip
-"""Errors (n, h) of predictions, by what the benchmark calls them."""
+"""Errors (n, h) of predictions, by the names of the benchmark."""
 
 
 def load(
     *, validation: int = 1, left_out: str | None = None, root: str | Path | None = None
 ) -> Dataset:
-    """Flights for estimation by kind, and those of the test where they are at hand.
+    """Flights for estimation by kind, and those of the test if their files exist.
 
     Args:
-        validation: flights of each kind that choose the iterate, the last ones.
-        left_out: a kind of flight, ``"chirp"``, ``"random"`` or ``"square"``, that is not for
-            estimation but a test, in place of the official one.
+        validation: number of last flights of each kind that choose the iterate.
+        left_out: a kind of flight, ``"chirp"``, ``"random"`` or ``"square"``, that replaces the
+            official test and is not used for estimation.
         root: folder that holds ``nanodrone/train_*.npz`` and ``nanodrone/test_*.npz``, or the
             folders ``nanodrone/train/`` and ``nanodrone/test/`` of the release.
 
     Shape:
-        u: (T, 4), y: (T, 12), T about 6000, or 1900 of squares.
+        u: (T, 4), y: (T, 12), T about 6000, or 1900 for squares.
 
     Example:
         >>> data = lfrtorch.datasets.nanodrone.load(root="benchmarks")  # doctest: +SKIP
@@ -150,13 +151,13 @@ def load(
 
 
 def _files(folder: Path, use: str, kind: str) -> list[Path]:
-    """The flights of one kind, as arrays or as the release has them."""
+    """Files of the flights of one kind, as arrays or as in the release."""
     arrays = sorted(folder.glob(f"{use}_{kind}*.npz"))
     return arrays or sorted((folder / use).glob(f"{kind}*.csv"))
 
 
 def _flight(path: Path) -> Record:
-    """One file as a record."""
+    """Read one file as a record."""
     read = _released if path.suffix == ".csv" else _arrays
     with official.readable(path, _HOLDS[path.suffix]):
         u, y, fs = (np.array(part, dtype=np.float64) for part in read(path))
@@ -174,13 +175,13 @@ def _flight(path: Path) -> Record:
 
 
 def _arrays(path: Path) -> tuple[Array, Array, Array]:
-    """The u, y and fs of an archive of arrays."""
+    """Read u, y and fs from an archive of arrays."""
     with np.load(path, allow_pickle=False) as file:
         return file["u"], file["y"], file["fs"]
 
 
 def _released(path: Path) -> tuple[Array, Array, float]:
-    """The u, y and fs of a file of the release."""
+    """Read u, y and fs from a file of the release."""
     with path.open() as file:
         names = file.readline().strip().split(",")
         table = np.genfromtxt(file, delimiter=",", dtype=np.float64).reshape(-1, len(names))

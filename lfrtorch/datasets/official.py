@@ -1,4 +1,4 @@
-"""Official measurements: found on disk or downloaded, read, and cut in time."""
+"""Official measurements: search or download, reading, and cuts in time."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from lfrtorch.data.dataset import Published
 from lfrtorch.data.records import Channel, Record, Start
 
 Shape = tuple[int | None, ...]
-"""Of an array in a file; None for an axis of any length."""
+"""Shape of an array in a file; None for an axis of any length."""
 
 BOARD = "leaderboard of nonlinearbenchmark.org"
-"""What a published score is cited by that stands there."""
+"""Citation of a published score on nonlinearbenchmark.org."""
 
 LEGACY = f"{BOARD}, before it fixed its splits"
-"""The same for one on other samples, estimation or test, than it asks for now."""
+"""Citation of such a score on samples, estimation or test, that the site no longer uses."""
 
 
 def cache() -> Path:
-    """Where the package nonlinear_benchmarks keeps its downloads."""
+    """Folder in which the package nonlinear_benchmarks keeps its downloads."""
     if sys.platform == "win32":
         folder = os.environ.get("LOCALAPPDATA", "~/AppData/Local") + "/nonlinear_benchmarks"
     elif sys.platform == "darwin":
@@ -47,7 +47,7 @@ def cache() -> Path:
 
 
 def folder(root: str | Path | None) -> Path:
-    """The benchmarks' folder: ``root``, or the cache folder if it is None."""
+    """Folder of the benchmarks: ``root``, or the cache folder if it is None."""
     return cache() if root is None else Path(root).expanduser()
 
 
@@ -59,9 +59,9 @@ def find(
     others: Sequence[str] = (),
     download: bool = False,
 ) -> Path:
-    """Return the path of a benchmark's ``root / file``, or of the first of others that do as well.
+    """Path of a benchmark's ``root / file``, or of the first existing one of ``others``.
 
-    With ``download`` the function ``loader`` of nonlinear_benchmarks fetches a missing file.
+    The function ``loader`` of nonlinear_benchmarks fetches a missing file, if ``download``.
     """
     true_or_false("download", download)
     below = folder(root)
@@ -92,7 +92,7 @@ def find_tests(
     others: Sequence[str] = (),
     download: bool = False,
 ) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Return the paths of the test files that are there, by test, and a note on the others."""
+    """Paths of the existing test files, by test, and a note on the missing ones."""
     below, found = folder(root), {}
     for test, file in files.items():
         if download or _present(below, (file, *others)):
@@ -105,7 +105,7 @@ def find_tests(
 
 
 def archive_note(archive: Path, md5: str, file: str) -> str:
-    """Say if the archive that ``file`` was unpacked from has the known checksum."""
+    """Note on the checksum of the archive from which ``file`` was unpacked."""
     if not _there(archive):
         return f"no {archive.name} beside {file}: its checksum is unknown"
     with archive.open("rb") as content:
@@ -120,7 +120,7 @@ def archive_note(archive: Path, md5: str, file: str) -> str:
 def read_arrays(path: Path, shapes: Mapping[str, Shape], member: str = "") -> dict[str, Array]:
     """Read arrays of a .mat file, or of the ``member`` of a zip archive, by name.
 
-    (samples,) is the shape of a signal that is a row or a column of the file.
+    Signals that are a row or a column of the file have the shape (samples,).
     """
     content = _unpacked(path, member) if path.suffix == ".zip" else path
     found: dict[str, Array] = {}
@@ -152,20 +152,20 @@ def read_struct(path: Path, name: str, fields: Sequence[str]) -> list[Array]:
 
 
 def read_npz(path: Path) -> dict[str, Array]:
-    """Read all arrays of a .npz file by name; refuse NaN and what is no number."""
+    """Read all arrays of a .npz file by name; refuse NaN, and anything but numbers."""
     with readable(path, "arrays"), path.open("rb") as content, np.load(content) as file:
         found = {name: file[name] for name in file.files}
     return {name: _numbers(path, name, array, (array.shape,)) for name, array in found.items()}
 
 
 def without_tests(missing: Sequence[str], why: str, *, partly: bool) -> tuple[str, ...]:
-    """Return the note on missing tests; ``partly`` if others are there."""
+    """Note on missing tests; ``partly`` if others exist."""
     names = f" {', '.join(missing)}" if partly else ""
     return (f"no test records{names}: {why}",) if missing else ()
 
 
 def held_out(samples: int, validation: float, least: int = 1) -> int:
-    """Return how many of the estimation samples validate; ``least`` must be left for training."""
+    """Number of estimation samples that validate; ``least`` must be left for training."""
     number("validation", validation, positive=True)
     count = round(samples * min(validation, 1))
     if not 0 < count <= samples - least:
@@ -182,8 +182,8 @@ def part(
 ) -> Record:
     """Cut samples ``first`` to ``last`` out, with ``warm_up`` unscored samples before them.
 
-    From zero state the transient falls into the warm-up, and an estimated start state is fitted to
-    the warm-up: no state has to be estimated from outputs that are scored.
+    The transient from zero state falls into the warm-up. An estimated start state is fitted to the
+    warm-up, and never to outputs that are scored.
     """
     return replace(whole[first - warm_up : last], name=name, skip=warm_up, start=start)
 
@@ -191,7 +191,7 @@ def part(
 def record(
     u: Array, y: Array, inputs: Mapping[str, str], outputs: Mapping[str, str], **settings: Any
 ) -> Record:
-    """Make a record of channels with these names and units; it is official unless said."""
+    """Make a record of channels with these names and units; by default its source is official."""
     given = {"source": "official", **settings}
     for use, channels in (("inputs", inputs), ("outputs", outputs)):
         given[use] = tuple(Channel(name, unit) for name, unit in channels.items())
@@ -227,7 +227,7 @@ def chosen_levels(levels: Sequence[int], known: Sequence[int]) -> list[int]:
 
 
 def _there(path: Path) -> bool:
-    """Whether there is such a file, and no empty archive in its place."""
+    """Tell if a file exists and is no empty archive."""
     return path.is_file() and (path.suffix != ".zip" or path.stat().st_size > 0)
 
 
@@ -249,7 +249,7 @@ def _download(below: Path, file: str, loader: str) -> None:
     below.mkdir(parents=True, exist_ok=True)
     try:
         getattr(package, function)(data_file_locations=True, dir_placement=below)
-    except Exception as error:  # plain Exceptions among them
+    except Exception as error:  # it may raise plain Exceptions
         raise OSError(
             f"nonlinear_benchmarks.{loader}() failed ({error!r}); remove what it left in "
             f"'{below / file.partition('/')[0]}' and try again, or give the folder that holds "
@@ -265,7 +265,7 @@ def _unpacked(path: Path, member: str) -> BytesIO:
 
 
 def _numbers(path: Path, name: str, found: NDArray[Any], shapes: Sequence[Shape]) -> Array:
-    """What was found of a name, if it has one of the shapes and is real and finite."""
+    """Check that a variable has one of the shapes and is real and finite."""
     fits = any(
         len(shape) == found.ndim
         and all(n in (None, own) for n, own in zip(shape, found.shape, strict=True))
@@ -291,5 +291,5 @@ def readable(path: Path, what: str) -> Iterator[None]:
 
 
 def again(path: Path) -> str:
-    """Say what to do about a file that cannot be used."""
+    """Advice on a file that cannot be used."""
     return f"remove '{path.name}' and any archive beside it, and download them again."

@@ -2,13 +2,13 @@
 
 Input u (V), output y (V), in steady state, at 78125 Hz: periods of 16384 samples of random-phase
 multisines at five levels, and a test of growing amplitude, the arrow. The official file has two
-periods of everything, and at each level 20 realisations for estimation and one more as a test. The
-stand-in has records of the same shapes (:mod:`lfrtorch.datasets.parwh_simulator`); each record's
-``source`` says whose it is, and a score on the stand-in is not one on the official data.
+periods of every record, and at each level 20 realisations for estimation and one more as a test.
+The stand-in has records of the same shapes (:mod:`lfrtorch.datasets.parwh_simulator`). The
+``source`` of each record names its origin: scores on the stand-in are no scores on the official
+data.
 
-The official file is read here as it is laid out: the package nonlinear_benchmarks, whose function
-for this benchmark downloads it, interleaves the two periods sample by sample and leaves the arrow
-out.
+The official file is read directly. The package nonlinear_benchmarks, which downloads it,
+interleaves the two periods sample by sample and leaves the arrow out.
 
 References:
     M. Schoukens, A. Marconato, R. Pintelon, G. Vandersteen, Y. Rolain (2015), "Parametric
@@ -43,8 +43,8 @@ _SOURCES = ("auto", "official", "stand-in")
 _FILE = "ParWH/ParWHFiles/ParWHData.mat"  # below the benchmarks' folder
 _ARCHIVE = "ParWH/ParWHFiles.zip"
 _OTHERS = ("ParWH/ParWHData.mat", _ARCHIVE)
-_MD5 = "5836dc66b0296b43ba4b8613a032408b"  # of the archive
-_PERIODS, _REALISATIONS = 2, 20  # of the estimation part, at each level
+_MD5 = "5836dc66b0296b43ba4b8613a032408b"  # checksum of the archive
+_PERIODS, _REALISATIONS = 2, 20  # realisations of the estimation part, at each level
 _SHAPES = {  # samples, periods, realisations, levels
     **dict.fromkeys(("uEst", "yEst"), (PERIOD, _PERIODS, _REALISATIONS, len(LEVELS))),
     **dict.fromkeys(("uVal", "yVal"), (PERIOD, _PERIODS, 1, len(LEVELS))),
@@ -72,7 +72,7 @@ def load(
     Training has ``realisations`` records a level and validation one a level. The tests are another
     realisation at each of the five levels (``"level_100"`` .. ``"level_1000"``), and ``"arrow"``,
     noise in the band of the multisines with an amplitude that grows from 0, its first 500 samples
-    unscored. Of the two periods of a test the second is scored.
+    unscored. The second of the two periods of a test is scored.
 
     Official data: the last of the 20 realisations validates, the others train. The stand-in's tests
     are noise free, its training and validation are not.
@@ -82,17 +82,17 @@ def load(
             ``"stand-in"``; or ``"auto"``, the official file if it is at hand, else the stand-in.
         root: folder that holds ``ParWH/ParWHFiles/ParWHData.mat`` (or ``ParWH/ParWHData.mat``, or
             ``ParWH/ParWHFiles.zip`` with the file in it). If given, ``"auto"`` requires the file.
-        seed: of the official data, chooses what trains: record r of a level, counted from 0, is
-            realisation ``(seed + r) % 19``. Of the stand-in, seeds all records: record r of a level
-            (mV) and use, train 0, validation 1, level test 2 and arrow 3, draws first its phases,
-            then its noise from the child
-            ``numpy.random.SeedSequence(seed, spawn_key=(use, level, r))``: it stays the same
-            whatever else is asked for.
-        realisations: training records at each level; of the official data 1 to 19.
-        periods: of each training and validation record; the input repeats, the noise does not. Of
-            the official data 1, the second one, or 2.
-        levels: of training and validation, mV rms.
-        noise_rms: of white Gaussian noise on the stand-in's training and validation outputs, V.
+        seed: choice of the official training records: record r of a level, counted from 0, is
+            realisation ``(seed + r) % 19``. All records of the stand-in are drawn from it: record
+            r of a level (mV) and use, train 0, validation 1, level test 2 and arrow 3, draws
+            first its phases, then its noise from the child
+            ``numpy.random.SeedSequence(seed, spawn_key=(use, level, r))``, independently of all
+            other records.
+        realisations: training records at each level; 1 to 19 of the official data.
+        periods: periods of each training and validation record; the input repeats, the noise does
+            not. The official data have 1, the second one, or 2.
+        levels: levels of training and validation, mV rms.
+        noise_rms: rms of white Gaussian noise on the stand-in's training and validation outputs, V.
 
     Shape:
         u, y (V) of training and validation: (16384 periods, 1); of the tests: (16384, 1).
@@ -153,8 +153,7 @@ def _names(level: int, realisations: int) -> tuple[str, ...]:
 
 
 def _linear(levels: Sequence[int], realisations: int) -> dict[str, tuple[str, ...]]:
-    """Training records of the linear model of each test, as published: those of its level; of
-    1000 mV for the arrow."""
+    """Training records of each test's linear model, as published: its level; 1000 mV for arrow."""
     of_level = {f"level_{level}": _names(level, realisations) for level in levels}
     return of_level | ({"arrow": of_level["level_1000"]} if "level_1000" in of_level else {})
 
@@ -183,13 +182,13 @@ def _official(
         return arrays["uVal"][:, -1, 0, at], arrays["yVal"][:, -1, 0, at]
     last = _REALISATIONS - 1
     part = np.s_[:, -periods:, last if use == "validation" else (seed + r) % last, at]
-    # The periods follow one another; copied, to let go of the whole arrays.
+    # The periods follow one another; a copy releases the whole arrays.
     u, y = (arrays[name][part].flatten(order="F") for name in ("uEst", "yEst"))
     return u, y
 
 
 def _found(source: str, root: str | Path | None) -> Path | None:
-    """The official file, or None for the stand-in."""
+    """Find the official file; None for the stand-in."""
     if source == "stand-in":
         return None
     try:

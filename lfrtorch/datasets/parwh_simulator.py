@@ -32,7 +32,7 @@ FS = 78125.0
 PERIOD = 16384
 """Samples of a period."""
 
-_LINES = slice(1, 4096)  # of rfft, that are excited: 2 to 4096 counted from 1 at DC
+_LINES = slice(1, 4096)  # excited lines of rfft: 2 to 4096 counted from 1 at DC
 
 Signals = tuple[Array, Array]
 """Input and output, (samples,) each, V."""
@@ -55,11 +55,11 @@ def stand_in(use: str, level: int, r: int, *, seed: int, periods: int, noise_rms
 def multisine(
     *, rms: float = 1.0, seed: int | np.random.SeedSequence | np.random.Generator = 0
 ) -> Array:
-    """One period of a random-phase multisine: lines 1 to 4095 of 4.77 Hz, of equal magnitude.
+    """Period of a random-phase multisine: lines 1 to 4095 of 4.77 Hz, of equal magnitude.
 
     Args:
-        rms: V.
-        seed: of the phases, uniform, or a generator to draw them from.
+        rms: rms, V.
+        seed: seed of the uniform phases, or a generator to draw them from.
 
     Shape:
         (16384,), V.
@@ -81,10 +81,10 @@ def multisine(
 
 
 def simulate(u: ArrayLike) -> Array:
-    """Output in the steady state that the input, repeated for ever, leads to; noise free.
+    """Output in periodic steady state under the repeated input; noise free.
 
-    Exact: a filter in steady state multiplies each spectral line by its frequency response, and the
-    saturations act sample by sample.
+    The result is exact: a filter in steady state multiplies each spectral line by its frequency
+    response, and the saturations act sample by sample.
 
     Args:
         u: one period, or several, of any length.
@@ -122,7 +122,7 @@ def simulate(u: ArrayLike) -> Array:
 
 
 def _s(v: Array) -> Array:
-    """A smooth max(v, 0)."""
+    """Smooth max(v, 0)."""
     return 0.05 * np.logaddexp(0.0, v / 0.05)
 
 

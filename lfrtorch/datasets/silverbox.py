@@ -29,12 +29,12 @@ __all__ = ["load"]
 _FILE = "Silverbox/SilverboxFiles/SNLS80mV.mat"
 _FS = 1e7 / 2**14  # Hz
 _SAMPLES = 131_072
-_ESTIMATION = (40_650, 105_712)  # of the multisines, three quarters
+_ESTIMATION = (40_650, 105_712)  # samples of the multisines, three quarters
 _SKIP = 50  # samples, unscored, of the tests
 _TESTS = {  # first sample, and the one after the last
     "multisine": (105_712, 127_400),
     "arrow": (100, 40_575),
-    "arrow_no_extrapolation": (100, 32_100),  # of the multisines' amplitudes
+    "arrow_no_extrapolation": (100, 32_100),  # samples within the amplitudes of the multisines
 }
 
 
@@ -45,18 +45,18 @@ def load(
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
-    """The measurement, cut in time into a training, a validation and three test records.
+    """Measurement cut in time into a training, a validation and three test records.
 
     All records are simulated from zero state. The arrow begins at rest. The others begin amid the
-    measurement, and what a zero state does to the output (40 to 80 mV) fades by a factor of 6 every
-    50 samples only: after the 50 that the tests leave out it would still add 0.14 mV to the rms
-    error of the multisine test. So that test and validation begin ``warm_up`` samples earlier, with
-    the input of the samples before theirs, and training leaves as many out.
+    measurement, and the effect of a zero state on the output (40 to 80 mV) fades by a factor of 6
+    every 50 samples only. After the 50 samples that the tests leave out it would still add 0.14 mV
+    to the rms error of the multisine test. So that test and validation begin ``warm_up`` samples
+    earlier, with the input of the samples before theirs, and training leaves as many out.
 
     Args:
-        validation: fraction of the estimation samples, the last of them, that validate.
+        validation: last fraction of the estimation samples, which validates.
         warm_up: samples that are simulated and not scored.
-        download: whether a missing file is downloaded.
+        download: download a missing file.
         root: folder that holds ``Silverbox/SilverboxFiles/SNLS80mV.mat``.
 
     Shape:

@@ -9,12 +9,12 @@ used here), u and y. ``WH_EstimationExample.mat`` (10 records) is for estimation
 16384 samples and 0.71 V rms each, measured *without* process noise.
 
 Noise before a nonlinearity is not noise at the output. The simulation error on records that have it
-has a large floor, and the fit that makes it least tends to the mean output given the input,
+has a large floor, and the fit that minimises it tends to the mean output given the input,
 E f(x + e) in place of f(x): a smoother saturation than the tests', a bias which does not fade with
-more data. So errors on training and validation are no measure of those on the tests, neither in
-size nor, near the floor, in order.
+more data. So errors on training and validation do not measure those on the tests, neither in size
+nor, near the floor, in order.
 
-There is no official split, window or statement of whether records begin at rest (and none of this
+There is no official split or window, and no statement that records begin at rest (and none of this
 is checked on the files). All are simulated from zero state, whose effect lies in the first 100
 samples; these are not scored, as in identibench.
 
@@ -43,7 +43,7 @@ _FILES = "WienHammer/WienerHammersteinFiles"
 _ESTIMATION, _TEST = "WH_EstimationExample.mat", "WH_TestDataset.mat"
 _LOADER = "not_splitted_benchmarks.WienerHammerstein_Process_Noise"
 _FS = 78125.0  # Hz
-_SKIP = 100  # samples, unscored, of all records
+_SKIP = 100  # unscored samples of all records
 _TESTS = ("multisine", "sweep")  # the columns of the test file
 
 _NOTE = (
@@ -53,13 +53,13 @@ _NOTE = (
 
 
 def load(*, validation: int = 2, download: bool = False, root: str | Path | None = None) -> Dataset:
-    """The realisations of the estimation file, and the two tests.
+    """Realisations of the estimation file, and the two tests.
 
     Without the test file there are no tests, and a note says so.
 
     Args:
-        validation: how many realisations, the last of them, validate.
-        download: whether files that are missing are downloaded (423 MB) by nonlinear_benchmarks.
+        validation: number of last realisations that validate.
+        download: download missing files (423 MB) by nonlinear_benchmarks.
         root: folder that holds ``WienHammer/WienerHammersteinFiles/WH_EstimationExample.mat`` and
             ``WH_TestDataset.mat`` beside it.
 
@@ -73,7 +73,7 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
     integer("validation", validation, 1)
 
     def columns(path: Path) -> tuple[Array, Array]:
-        """u and y (samples, records)."""
+        """Arrays u and y (samples, records)."""
         u, y = official.read_struct(path, "dataMeas", ("u", "y"))
         if len(u) <= _SKIP:
             raise InputError(

@@ -38,10 +38,10 @@ def load(
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
-    """The measurement, cut in time into a training, a validation and the test records.
+    """Measurement cut in time into a training, a validation and the test records.
 
-    The tests are ``"test"``, the official one, and ``"site"``. With ``split="site"``, which trains
-    on the site's estimation part, the latter is the only one, as the former overlaps the training.
+    The tests are ``"test"``, the official one, and ``"site"``. ``split="site"`` trains on the
+    site's estimation part, which overlaps ``"test"``, and leaves ``"site"`` alone.
 
     Validation and ``"test"`` begin amid the measurement. They are simulated from zero state, 1000
     samples ahead of what they score: validation begins that much earlier, in the training part, and
@@ -50,11 +50,11 @@ def load(
 
     Args:
         split: ``"official"`` or ``"site"``.
-        validation: fraction of the estimation samples, the last of them, that validate.
-        skip: samples at the beginning of the training record that are not fitted. Default: 5000 of
-            the official split, the end of an earlier response (55 samples), then rest, as the input
-            starts at sample 4999; 1000 of the site's, which begins amid the measurement.
-        download: whether a missing file is downloaded.
+        validation: last fraction of the estimation samples, which validates.
+        skip: samples at the beginning of the training record that are not fitted. Default: 5000
+            for the official split, the end of an earlier response (55 samples), then rest, as the
+            input starts at sample 4999; 1000 for the site's, which begins amid the measurement.
+        download: download a missing file.
         root: folder that holds ``WienerHammerBenchMark/WienerHammerBenchMark.mat``.
 
     Shape:

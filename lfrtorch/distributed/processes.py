@@ -2,10 +2,10 @@
 
     torchrun --nproc-per-node 2 script.py
 
-with ``with connect(): fit(...)`` in the script: gloo between CPUs, NCCL between GPUs. Within it
-``current()`` has the processes, whoever asks. ``Ranks.sharing_records`` decides what is shared. All
-processes take the same steps, for what decides is a sum over all of them or the first one's:
-rounding errors differ from one kind of processor to another, and a search lets them grow.
+The script has ``with connect(): fit(...)``: gloo between CPUs, NCCL between GPUs. Inside,
+``current()`` has the processes. ``Ranks.sharing_records`` decides if starts or records are shared.
+All processes take the same steps, since every decision uses a sum over all of them, or the number
+of the first one: rounding errors differ between processors, and a search lets them grow.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from lfrtorch._support.reasons import Reason, told
 
 Shared = TypeVar("Shared")
 
-_AXES = 8  # most axes of a tensor that is handed on
+_AXES = 8  # most axes of a tensor that is sent
 
 
 class ProcessLostError(LfrtorchError, RuntimeError):
-    """Another process ended, or did not answer in time."""
+    """Error of a process whose partner ended, or did not answer in time."""
 
     def __init__(self, detail: str) -> None:
         super().__init__(told(Reason.PROCESS_LOST, detail))
@@ -39,7 +39,7 @@ class ProcessLostError(LfrtorchError, RuntimeError):
 
 
 class Ranks:
-    """One process that holds all records; ``ProcessGroup`` is several.
+    """Single process that holds all records; ``ProcessGroup`` is several.
 
     Example:
         >>> ranks = lfrtorch.distributed.Ranks()
@@ -50,31 +50,31 @@ class Ranks:
     rank, world = 0, 1
 
     def share(self, items: list[Shared]) -> list[Shared]:
-        """The items that this process holds: every ``world``-th."""
+        """Items of this process: every ``world``-th."""
         return items[self.rank :: self.world]
 
     def sharing_records(self, starts: int) -> Ranks:
-        """The processes that share the records of each start: one, if they share the starts."""
+        """Processes that share the records of each start: one, if they share the starts."""
         return Ranks() if 1 < self.world <= starts else self
 
     def enough_for(self, items: int) -> Ranks:
-        """These processes; this one alone, as each of them, if there are fewer items than they."""
+        """These processes; each alone, if there are fewer items than processes."""
         return self if items >= self.world else Ranks()
 
     def sum(self, part: Tensor) -> Tensor:
-        """The sum of all processes' parts, on each of them."""
+        """Sum of all processes' parts, on each of them."""
         return part
 
     def stack(self, part: Tensor) -> Tensor:
-        """The rows of all processes' parts, which may differ in number, on each of them."""
+        """Rows of all processes' parts, which may differ in number, on each of them."""
         return part
 
     def first(self, part: Tensor) -> Tensor:
-        """The part of the first process, whatever its shape, on each of them."""
+        """Part of the first process, of any shape, on each of them."""
         return part
 
     def close(self) -> None:
-        """Leave the other processes: what they share from now on ends in a ``ProcessLostError``."""
+        """Leave the other processes: their next exchange ends in a ``ProcessLostError``."""
 
     def __enter__(self) -> Self:
         _CURRENT.append(self)
@@ -86,11 +86,11 @@ class Ranks:
 
 
 _CURRENT = [Ranks()]
-"""The processes that work together now, last; those before wait for them."""
+"""Stack of processes: the last ones work together now, the others wait for them."""
 
 
 def current() -> Ranks:
-    """The processes that work together now: those of the last ``connect``, or this one alone.
+    """Processes that work together now: those of the last ``connect``, or this one alone.
 
     Example:
         >>> lfrtorch.distributed.current().world
@@ -101,7 +101,7 @@ def current() -> Ranks:
 
 @contextmanager
 def using(ranks: Ranks | None) -> Iterator[Ranks]:
-    """Let other processes work together meanwhile; with None it stays as it is.
+    """Let other processes work together in a context; None changes nothing.
 
     Example:
         >>> with lfrtorch.distributed.using(lfrtorch.distributed.Ranks()) as alone:
@@ -116,7 +116,7 @@ def using(ranks: Ranks | None) -> Iterator[Ranks]:
 
 
 def agreed(part: Tensor) -> Tensor:
-    """The numbers of the first process, on each of those that work together.
+    """Numbers of the first process, on each of those that work together.
 
     Example:
         >>> lfrtorch.distributed.agreed(torch.ones(2))
@@ -126,16 +126,16 @@ def agreed(part: Tensor) -> Tensor:
 
 
 def connect(device: str | torch.device = "cpu", timeout: float = 600.0) -> Ranks:
-    """The processes that torchrun started, or the one that is alone; use it in a ``with``.
+    """Context of the processes that torchrun started, or of a single process.
 
     Args:
-        device: where the model is: ``"cpu"``, or ``"cuda"`` for each process its own GPU.
-        timeout: seconds after which a process that does not answer counts as lost: amply more than
-            the slowest share of an iteration.
+        device: device of the model: ``"cpu"``, or ``"cuda"`` for each process its own GPU.
+        timeout: seconds after which a process that does not answer counts as lost. It should be
+            much longer than the slowest share of an iteration.
 
     Raises:
         ValueError: a timeout that is not positive.
-        ProcessLostError: the others did not come.
+        ProcessLostError: other processes did not connect in time.
 
     Example:
         >>> with lfrtorch.distributed.connect() as ranks:  # alone: no torchrun
@@ -163,10 +163,10 @@ def connect(device: str | torch.device = "cpu", timeout: float = 600.0) -> Ranks
 
 
 class ProcessGroup(Ranks):
-    """The processes of torch's default group.
+    """Processes of torch's default group.
 
     Args:
-        device: where its backend works.
+        device: device of its backend.
 
     Raises:
         ProcessLostError: a process ended, or did not answer in time; from any of the methods.
@@ -174,16 +174,16 @@ class ProcessGroup(Ranks):
 
     def __init__(self, device: str | torch.device = "cpu") -> None:
         self.rank, self.world = dist.get_rank(), dist.get_world_size()
-        self._device = torch.device(device)  # that of the backend
+        self._device = torch.device(device)  # the timeout of the backend
 
     def sum(self, part: Tensor) -> Tensor:
-        """The sum of all parts."""
+        """Sum of all parts."""
         total = self._sent(part).clone()
         self._call(lambda: dist.all_reduce(total))
         return total.to(part.device)
 
     def stack(self, part: Tensor) -> Tensor:
-        """The rows of all parts."""
+        """Rows of all parts."""
         count = torch.tensor([len(part)], device=self._device)
         counts = [torch.empty_like(count) for _ in range(self.world)]
         self._call(lambda: dist.all_gather(counts, count))
@@ -197,7 +197,7 @@ class ProcessGroup(Ranks):
         return torch.cat(cut).to(part.device)
 
     def first(self, part: Tensor) -> Tensor:
-        """The part of the first process."""
+        """Part of the first process."""
         shape = [part.ndim, *part.shape, *[0] * (_AXES - part.ndim)]
         known = torch.tensor(shape, device=self._device)
         self._call(lambda: dist.broadcast(known, 0))
@@ -219,13 +219,13 @@ class ProcessGroup(Ranks):
     def _call(self, collective: Callable[[], object]) -> None:
         try:
             collective()
-        except RuntimeError as error:  # of whatever kind the backend has
+        except RuntimeError as error:  # the backend has errors of any kind
             other = f"rank {1 - self.rank}" if self.world == 2 else "one of the others"
             seen = f"rank {self.rank} of {self.world} has no answer from {other}"
             raise ProcessLostError(f"{seen} ({_gist(error)})") from error
 
 
 def _gist(error: Exception) -> str:
-    """A backend's message without its source file and its advice."""
+    """Message of a backend without its source file and its advice."""
     text = re.sub(r"^\[[^]]*\]\s*", "", str(error))
     return text.split(". ")[0]

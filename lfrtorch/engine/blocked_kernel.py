@@ -27,7 +27,7 @@ SAMPLES = 12
 """Samples in a block: 8 to 16 are as fast for 12 to 28 states; the responses then fit in cache."""
 
 _WIDER = 2
-"""Samples after which the responses, which grow, are copied to wider room."""
+"""Samples after which the growing responses are copied to a wider array."""
 
 _TOGETHER = 32
 """Least columns of a product, but for the last one."""
@@ -51,7 +51,7 @@ def _rows(
     job, sizes, weights, code, u, x, z, w, r0, t_first,
     x_entries, z_entries, y_entries, static, chunks, S, rows,
 ):  # fmt: skip
-    """What ``jacobian_rows`` writes, from the same arguments.
+    """Write the rows that ``jacobian_rows`` writes, from the same arguments.
 
     BLAS rounds by the sizes of a product, so these are the same for any number of jobs.
     """
@@ -150,7 +150,7 @@ def _rows(
 def _responses(AT, Cz, CyT, DywT, J, M, room, P, QW):
     """Fill P (nx, b, row of a response) and QW, the rows of Q and then of W (nw, b), transposed.
 
-    M has Bwᵀ below the place of Fᵀ. What a block leaves untouched stays zero.
+    M has Bwᵀ below the place of Fᵀ. Entries that a block does not write stay zero.
     """
     (nx, ny), nw = CyT.shape, len(DywT)
     width, steps = nx, P.shape[1]
@@ -200,7 +200,7 @@ def add_feedback(driveT, J, Cz, out):
 def _sorted(x_entries, n_z, n_y, C, nx):
     """All columns but those of y, which leave S alone, and where products of them begin.
 
-    First come those of x, by the state that they drive: where each state's begin is returned, too.
+    Columns of x come first, by the state that they drive; also returned: each state's first one.
     Their products hold all columns of a state, as these share its P.
     """
     n_x, start = len(x_entries), np.zeros(nx + 1, np.int64)
@@ -223,7 +223,7 @@ def _sorted(x_entries, n_z, n_y, C, nx):
 
 @njit(nogil=True)
 def _without_dust(source, target, n):
-    """The first n columns, with zeros for what would fade to denormal numbers: these are slow."""
+    """The first n columns; entries that fade to denormal numbers, which are slow, become 0."""
     for c in range(len(source)):
         for i in range(n):
             a = source[c, i]

@@ -28,7 +28,7 @@ _DECAY = 0.9
 """Magnitude of all eigenvalues of a random A."""
 
 _SAME = 1e-6
-"""Relative difference of two values of an entry that are the same, in single precision, too."""
+"""Relative difference below which two values of an entry are equal, also in single precision."""
 
 
 class Matrices(NamedTuple):
@@ -58,8 +58,8 @@ class LFRCell(nn.Module):
     Args:
         nu, ny, nx, nz, nw: sizes; ``nz = nw = 0`` without ``static`` is a linear model.
         static: the map z -> w: any module from (..., nz) to (..., nw).
-        random: False leaves all matrices at zero, for who fills them.
-        device, dtype: of the matrices, as in any torch module.
+        random: False leaves all matrices at zero, for a caller that fills them.
+        device, dtype: as in any torch module, for the matrices.
 
     Shape:
         A: (nx, nx), Bu: (nx, nu), Bw: (nx, nw), Cz: (nz, nx), Dzu: (nz, nu), Cy: (ny, nx),
@@ -144,7 +144,7 @@ class LFRCell(nn.Module):
 
     @torch.no_grad()
     def hold(self, given: Held) -> None:
-        """Put values into entries, which every fit leaves so.
+        """Hold entries at given values: every fit keeps them.
 
         Args:
             given: masks and values by the names of the parameters, as ``engine.held`` makes them.
@@ -208,11 +208,11 @@ class LFRCell(nn.Module):
 
     @property
     def map(self) -> StaticMap:
-        """The static map, which answers what the package asks of one."""
+        """The static map as a ``StaticMap``."""
         return as_map(self.static, self.nz, self.nw)
 
     def weights(self, given: Sequence[Tensor] | None = None) -> Weights:
-        """All numbers of the cell as they are now, or those of its parameters as given."""
+        """Vector of all numbers of the cell: those it has now, or the parameters that are given."""
         named = list(self.named_parameters())
         parameters = [(name, p.numel(), p.requires_grad) for name, p in named]
         sizes = self.nx, self.nu, self.ny, self.nz, self.nw
@@ -225,9 +225,9 @@ class LFRCell(nn.Module):
         return Matrices(*(to_float64(self.get_parameter(name)) for name in Matrices._fields))
 
     def check(self) -> None:
-        """Refuse weights that do not fit each other, which machine code would not notice.
+        """Refuse weights of inconsistent shapes, which machine code would not notice.
 
-        A map of a class that has no ``weight_shapes`` is left to torch.
+        A map whose class has no ``weight_shapes`` is checked by torch alone.
 
         Raises:
             ValueError: a weight of another shape, dtype or device.

@@ -14,11 +14,14 @@ from lfrtorch._support.types import Array
 from lfrtorch.data.records import Channel
 from lfrtorch.engine.operating_point import StateSpace
 
-_MOST_POLES, _MOST_GAINS = 6, 4
-"""Most rows of the tables; poles of the largest radius are kept."""
+_MOST_POLES = 6
+"""Most rows of the table of poles; those of the largest radius are kept."""
+
+_MOST_GAINS = 4
+"""Most rows of the table of gains."""
 
 _INTEGRATES = 1e-9
-"""Distance of a pole from 1 up to which there is no gain at rest."""
+"""Distance of a pole from 1 up to which it integrates: there is no static gain."""
 
 _ROUNDING = 1e-12
 """An offset below this part of the rms about it is a rounding error."""
@@ -28,13 +31,13 @@ _LISTED = 4
 
 
 def listed(channels: Sequence[Channel]) -> str:
-    """The channels with their units, the first ones if they are many."""
+    """Names and units of the channels; of many, the first ones."""
     more = ["..."] * (len(channels) > _LISTED)
     return ", ".join([*map(str, channels[:_LISTED]), *more])
 
 
 def levels(channels: Sequence[Channel], offset: Array, scale: Array | None = None) -> str:
-    """Offset of each channel and rms about it, the first ones if they are many."""
+    """Offset of each channel and rms about it; of many channels, the first ones."""
     said = []
     for i, channel in enumerate(channels[:_LISTED]):
         value = number(offset[i])
@@ -52,7 +55,7 @@ def in_columns(facts: Sequence[tuple[str, str | None]]) -> list[str]:
 
 
 def linear_text(model: Any) -> str:
-    """A linear model: what it was found from, its poles and its gains."""
+    """A linear model in words: its data, its poles and its static gains."""
     fit = model.fit
     facts = [
         ("sampled at", f"{model.fs:g} Hz"),

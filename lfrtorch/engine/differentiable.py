@@ -2,7 +2,7 @@
 
 Each pass in machine code is a ``torch.autograd.Function`` of its own, with a rule for ``vmap``: the
 simulation, its adjoint (gradients: ``grad``, ``jacrev``, ``backward``) and its tangent (``jvp``,
-``jacfwd``). None of the two derivatives has derivatives again.
+``jacfwd``). Neither derivative can be differentiated again.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ Batch = tuple[tuple[Tensor, ...], tuple[int, ...]]
 def _batched(
     function: type[Function], signals: int, info: Any, in_dims: Any, *inputs: Any
 ) -> Batch:
-    """A function of a cell, ``signals`` with an axis of records, and weights, of a batch."""
-    # More records are simulated at once. Weights that differ are each a simulation.
+    """Apply a function of a cell, ``signals`` with an axis of records, and weights to a batch."""
+    # A batch of signals is more records of one simulation; each set of weights is a simulation.
     first, tensors, axes = inputs[:2], inputs[2:], in_dims[2:]
     if all(axis is None for axis in axes[signals:]):
         B = info.batch_size
@@ -54,11 +54,11 @@ def _batched(
 
 
 class _Once(Function):
-    """A derivative, which has none itself."""
+    """A derivative that cannot be differentiated again."""
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        """Nothing is kept."""
+        """Keep nothing for a second derivative."""
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> NoReturn:
@@ -70,7 +70,7 @@ class _Once(Function):
 
 
 class _Adjoint(_Once):
-    """Derivatives of Σ e · y + end · x(T): by u, x0 and each record's θ."""
+    """Derivatives of Σ e · y + end · x(T) with respect to u, x0 and each record's θ."""
 
     @staticmethod
     def forward(

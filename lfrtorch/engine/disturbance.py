@@ -1,7 +1,7 @@
-"""A model and constant disturbances of its inputs and outputs, which is an NL-LFR again.
+"""An NL-LFR with constant disturbances of its inputs and outputs as further states.
 
-A disturbance d that nobody measures and that stays, a load or a leak, adds Eu d to the inputs and
-Ey d to the outputs. It is a state that keeps its value, so that an observer of both finds it::
+An unmeasured constant disturbance d, such as a load or a leak, adds Eu d to the inputs and Ey d to
+the outputs. It is modelled as a constant state, so that an observer estimates it with x::
 
     [x+]   [A  Bu Eu] [x]
     [d+] = [0    1  ] [d] + ...,    z = Cz x + Dzu (u + Eu d),    y = ... + (Dyu Eu + Ey) d
@@ -26,7 +26,7 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.operating_point import StateSpace
 
 _DRIFT = 0.1
-"""By so much of its scale a disturbance drifts in the slowest time constant, rms."""
+"""Drift of a disturbance per slowest time constant, relative to its scale (rms)."""
 
 _FASTEST, _SLOWEST = 1.0, 1e4  # time constants, in samples; integrators have none
 
@@ -63,15 +63,17 @@ def disturbance_scale(E: Float[Array, "n nd"], scaler: Scaler) -> Float[Array, "
 
 
 def drift_variance(moduli: Array, scale: Float[Array, " nd"]) -> Float[Array, " nd"]:
-    """Variance of what each disturbance changes by in a sample: a tenth of its scale in all of the
-    slowest time constant that is no integrator's, from the poles' moduli."""
+    """Variance of the change of each disturbance in one sample.
+
+    The rms change over the slowest time constant, from the moduli of the poles without
+    integrators, is a tenth of the disturbance's scale."""
     stable = moduli[moduli < math.exp(-1.0 / _SLOWEST)]
     slowest = -1.0 / math.log(max(stable.max(initial=0.0), math.exp(-1.0 / _FASTEST)))
     return (_DRIFT * scale) ** 2 / slowest
 
 
 def tells_apart(system: StateSpace, states: int) -> bool:
-    """Whether the outputs at rest tell the disturbances, the last states, from other causes."""
+    """Tell if the disturbances, the last states, are detectable from the outputs at rest."""
     # Pannocchia and Rawlings: [A - 1, Bd; C, Cd] has full column rank.
     rows = np.vstack([system.A[:states] - np.eye(states, len(system.A)), system.C])
     values = np.linalg.svd(rows / np.maximum(np.abs(rows).max(axis=0), 1e-300), compute_uv=False)

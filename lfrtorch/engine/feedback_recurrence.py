@@ -32,7 +32,7 @@ def states(
 ) -> Float[Tensor, "R T+1 nx"]:
     """All states of s(k+1) = F(k) s(k) + g(k) from the known s(0).
 
-    Backwards, all costates of s(k) = F(k)ᵀ s(k+1) + g(k) from the known s(T).
+    Backwards: costates of s(k) = F(k)ᵀ s(k+1) + g(k) from the known s(T).
     """
     if has_kernels(J):
         s = g.new_empty(len(g), g.shape[1] + 1, g.shape[2])
@@ -49,7 +49,7 @@ def states(
 def transition(
     W: Weights, J: Float[Tensor, "R T nw nz"], Phi: Float[Tensor, "R nx m"]
 ) -> Float[Tensor, "R nx m"]:
-    """F(T-1) ... F(0) Φ."""
+    """Product F(T-1) ... F(0) Φ: the transition matrix applied to Φ."""
     if not has_kernels(J):
         F = linearise_at(W, J).F
         return linear_recurrence(F, torch.zeros_like(F), Phi)[:, -1]

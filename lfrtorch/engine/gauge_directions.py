@@ -1,4 +1,4 @@
-"""Gauge directions: changes of a model's numbers that leave its output as it is.
+"""Gauge directions: changes of a model's numbers that leave its output unchanged.
 
 Many sets of matrices describe the same model. A change of coordinates x -> T x changes A, Bu, Bw,
 Cz and Cy, and no output. The same holds for z and w if the static map is a network, whose weights
@@ -28,8 +28,8 @@ ROUNDING = 1e-10
 def free_directions(cell: LFRCell) -> int:
     """Number of gauge directions that move no entry that a fit holds.
 
-    It is that of a model with other numbers in all entries that are not held: a start, whose static
-    map has no output, has more.
+    The count is the generic one, of random numbers in all entries that are not held. A start, whose
+    static map has no output, has more directions.
     """
     count = cell.nx**2 + sum((s.place.stop - s.place.start) ** 2 for s in cell.map.symmetries)
     if not cell.held:
@@ -40,7 +40,7 @@ def free_directions(cell: LFRCell) -> int:
         np.random.default_rng(0).standard_normal(int((~held).sum()))
     )
     G = gauge_directions(numbers, numbers.flat.new_zeros(0, cell.nx))[held]
-    # A column of zeros is a direction that moves none, as those of z and w are with zeros of x.
+    # A column of zeros is a direction that moves nothing: those of z and w, where x has zeros.
     G = G[:, G.any(axis=0)]
     diagonal = np.abs(np.diag(scipy.linalg.qr(G, mode="r", pivoting=True)[0]))
     return count - int((diagonal > ROUNDING * diagonal.max(initial=0.0)).sum())

@@ -1,7 +1,7 @@
 """Entries of a model that a fit holds, as masks with values.
 
-Each function returns what it holds, by the names of the parameters. ``LFRCell.hold`` puts the
-values in and unites the masks; where two of them want other values of an entry, that is an error.
+Each function returns masks and values by the names of the parameters. ``LFRCell.hold`` writes the
+values and unites the masks; two different values for one entry are an error.
 Gauge, steps and the count of parameters read the united mask alone.
 """
 
@@ -15,14 +15,14 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.weights import Held
 
 STRUCTURES = ("free", "wiener", "hammerstein", "wiener_hammerstein", "parallel")
-"""Blocks that a model may be made of."""
+"""Block structures of a model."""
 
 IN_SERIES = ("wiener_hammerstein", "parallel")
-"""Structures with as many states before the static map as after it."""
+"""Structures whose states are divided into those before and those behind the static map."""
 
 
 def structure(cell: LFRCell, kind: str, *, before: int | None = None) -> Held:
-    """Zeros of a model that is made of blocks.
+    """Zeros of a block structure.
 
     - ``"free"``: none;
     - ``"wiener"``: w acts on the output alone, Bw = 0;
@@ -34,9 +34,9 @@ def structure(cell: LFRCell, kind: str, *, before: int | None = None) -> Held:
       its own (:class:`lfrtorch.maps.direct_sum.DirectSum`).
 
     Args:
-        cell: its sizes count.
-        kind: which of these.
-        before: how many states make z. Default: half of them.
+        cell: the model whose sizes are used.
+        kind: one of these names.
+        before: number of states that drive z. Default: half of them.
 
     Raises:
         ValueError: a map that is no function for each z.
@@ -57,10 +57,10 @@ def structure(cell: LFRCell, kind: str, *, before: int | None = None) -> Held:
 
 
 def no_feedthrough(cell: LFRCell, *, z: bool, y: bool) -> Held:
-    """Zeros of a model whose input does not act on ``z``, or on ``y``, at once.
+    """Zeros of a model without feedthrough from the input to ``z``, or to ``y``.
 
-    On y it acts through w, too, so without ``y`` that path is closed: at Dzu, or else at Dyw. Known
-    equations keep what they say themselves.
+    The input also reaches y through w. Without ``y`` that path is closed at Dzu, or else at Dyw.
+    Known equations keep their own feedthrough.
     """
     known = cell.map.known
     first_z, first_w = (0, 0) if known is None else (known.nz, known.nw)
@@ -75,7 +75,7 @@ def no_feedthrough(cell: LFRCell, *, z: bool, y: bool) -> Held:
 
 
 def past_outputs(cell: LFRCell) -> Held:
-    """Zeros of a predictor, whose last inputs are the measured outputs: none acts at once."""
+    """Zeros of a predictor without feedthrough from its last inputs, the measured outputs."""
     last = torch.arange(cell.nu) >= cell.nu - cell.ny
     return {name: (last, torch.tensor(0.0)) for name in ("Dzu", "Dyu")}
 
@@ -87,7 +87,7 @@ def measured_states(cell: LFRCell) -> Held:
 
 
 def integrators(cell: LFRCell) -> Held:
-    """Columns of A and Cz of the exact integrators, as they are."""
+    """Columns of A and Cz of the exact integrators, at their present values."""
     states = integrating_states(cell)
     if not states.any():
         return {}

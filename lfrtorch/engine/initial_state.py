@@ -1,9 +1,9 @@
 """The initial state of a record, estimated from its output.
 
-An output tells the initial state until the last sample with a weight, and no longer than until the
-transition Φ(k) = ∂x(k)/∂x(0) has faded. Later samples cost nothing here but, before a fit, one
-simulation from rest. ``start_kernel`` has the search; a model whose map has no machine code takes
-its steps for all records at once.
+The output depends on the initial state until the transition Φ(k) = ∂x(k)/∂x(0) has faded, and
+counts until the last sample with a weight. Later samples cost nothing here but, before a fit, one
+simulation from rest. The search is in ``start_kernel``. A model whose map has no machine code takes
+the same steps in torch, for all records at once.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ _ODD = 1e-3
 """Least part of the cost that the prior adds if it makes a difference."""
 
 _FAR = 0.1
-"""Ratio of squared errors at which a state that the training data have not seen is believed. On
-50 samples of measurements it is 0.2 or more where the state is wrong for the rest of the record."""
+"""Ratio of squared errors below which a state far from the training data is accepted. Over 50
+measured samples it is 0.2 or more where the state is wrong for the rest of the record."""
 
 _FAR_BETTER = 0.25
 """Ratio of squared errors below which the state from a record's beginning is refined."""
 
 _AWAY = 100.0
-"""Growth of xᵀ P⁻¹ x, after the samples that tell the state, that means a runaway."""
+"""Growth of xᵀ P⁻¹ x, after the samples that determine the state, that counts as divergence."""
 
 _BEGINNING = 8
 """Least number of outputs in a beginning, for each state."""
@@ -60,11 +60,11 @@ def start_from_beginning(
     y: Float[Tensor, "R T ny"],
     weight: Float[Tensor, "R T ny"],
 ) -> Float[Tensor, "R nx"]:
-    """``estimated_start``, or the state that a half, a quarter, ... of each record tells.
+    """Initial state by ``estimated_start``, or from the first half, quarter, ... of each record.
 
-    The error of a long oscillation has many minima, one for each phase, and that of its beginning
-    has few. A beginning's state is refined on the whole record, and taken if the squared error is
-    far less.
+    The error over a long oscillation has many minima, one for each phase; over its beginning it has
+    few. The state from a beginning is refined on the whole record, and kept if it makes the squared
+    error far smaller.
     """
     W = model.weights()
     best, T = simulate(W, u, estimated_start(W, u, y, weight)), u.shape[1] // 2
@@ -83,7 +83,7 @@ def start_from_beginning(
 def measured_start(
     model: Numbers, u: Float[Tensor, "R nu"], y: Float[Tensor, "R ny"]
 ) -> Float[Tensor, "R nx"]:
-    """The state nearest to rest whose output is the measured one, or nearest to it."""
+    """State nearest to rest whose output is the measured one, or is nearest to it."""
     W = model.weights()
     x = u.new_zeros(len(u), W.nx)
     for _ in range(ITERATIONS):
@@ -110,14 +110,13 @@ def estimated_start(
 ) -> Float[Tensor, "R nx"]:
     """The most probable initial state, given the output and the factors of its errors.
 
-    Least squares alone follows the noise if samples are few and states many, and the model's
-    errors, which are as slow as its states. So a normal prior adds x0ᵀ P⁻¹ x0 to the squared errors
-    over their variance, see ``state_moments``; PASSES estimate that variance. The state of least
-    squares is taken if it is far better, as a system may begin far from where the training data
-    have been, or if the prior makes no difference, as with far more samples than states. From a
-    state after which the model runs away, though it does not from rest, the simulation begins at
-    rest instead. ``near`` is the state of a model close to this one: the search begins there, if
-    its errors are less than those from rest.
+    Least squares alone fits noise and slow model errors if samples are few and states many. So a
+    normal prior adds x0ᵀ P⁻¹ x0 to the squared errors divided by their variance
+    (``state_moments``); ``PASSES`` estimate that variance. The least squares state is kept in two
+    cases: if it is far better, as a system may begin far from the training data, or if the prior
+    makes no difference, as with far more samples than states. A state from which the model diverges
+    is replaced by rest, if the model does not diverge from rest. ``near`` is the initial state of a
+    similar model: the search begins there if its errors are smaller than those from rest.
     """
     W = model.weights()
     nx, factors = W.nx, to_float64(weight)
@@ -128,7 +127,7 @@ def estimated_start(
     moments = np.where(known[:, None], np.maximum(moments, _FLAT * moments[:, -1:]), 1.0)
     deviations = np.sqrt(moments)[:, None]
     white = np.ascontiguousarray((axes / deviations).swapaxes(1, 2)) * known[:, None, None]
-    # Nothing after the last sample with a weight tells the state.
+    # Samples after the last one with a weight do not count.
     last = 1 + int(np.flatnonzero(factors.any(axis=(0, 2))).max(initial=0))
     whole, u, y, weight = u, u[:, :last].contiguous(), y[:, :last], weight[:, :last]
     rest = simulate(W, u, None)
@@ -160,7 +159,7 @@ def _staying(
     x: Float[Tensor, "R S nx"],
     white: Float[Array, "R nx nx"],
 ) -> Float[Tensor, "R nx"]:
-    """The first of the states x, or 0 if the model runs away after them and not from 0."""
+    """First of the states x, or 0 if the model diverges after them but not from 0."""
 
     def farthest(states: Tensor) -> Array:
         sizes = ((to_float64(states) @ white.swapaxes(1, 2)) ** 2).sum(axis=2).max(axis=1)
@@ -174,10 +173,11 @@ def _staying(
 
 
 def state_moments(model: Numbers, u: Float[Tensor, "R T nu"]) -> Float[Array, "R nx nx"]:
-    """E x xᵀ, about 0, that initial states have before an output is known.
+    """Prior second moment E x xᵀ, about 0, of initial states.
 
-    It is the covariance of the states over the training data. Before a fit, when that is 1, it is
-    the second moment of the states that the input excites from rest: 0 if the model diverges.
+    After a fit it is the covariance of the states over the training data. Before a fit, when that
+    is 1, it is the second moment of the states that the input excites from rest; 0 if the model
+    diverges.
     """
     W = model.weights()
     P = to_float64(W.state_covariance)
@@ -190,7 +190,7 @@ def state_moments(model: Numbers, u: Float[Tensor, "R T nu"]) -> Float[Array, "R
 
 
 class _Prior(NamedTuple):
-    """v |white x0|² beside the squared errors: v is their variance, and is found with x0."""
+    """Prior term v |white x0|² beside the squared errors; their variance v is estimated with x0."""
 
     white: Float[Array, "R nx nx"]
     spread: Float[Array, "R nx nx"]  # its inverse
@@ -210,8 +210,8 @@ def _fitted_start(
 ) -> Trajectory:
     """Trajectory from the initial state that minimises |weight (y_hat - y)|², and the prior.
 
-    Gauss-Newton from ``best``; a step that does not lower the cost is quartered. The prior's weight
-    comes down from its largest in the first steps, unless the search begins ``settled``.
+    Gauss-Newton from ``best``; a step that does not lower the cost is quartered. The weight of the
+    prior falls from its largest value in the first steps, unless the search begins ``settled``.
     """
     if prior is None:
         none = np.zeros((len(u), W.nx, W.nx))
@@ -282,7 +282,7 @@ def _squares(
 
 
 def _chosen(which: Booleans, these: Trajectory, others: Trajectory) -> Trajectory:
-    """The trajectories of some records, and others for the rest."""
+    """Combine trajectories: some records from one set, the rest from another."""
     if which.all() or not which.any():
         return these if which.all() else others
     mask = torch.from_numpy(which).to(these.x.device)[:, None, None]
@@ -296,7 +296,7 @@ def _factor(
     errors: Float[Tensor, "R T ny"],
     at: Trajectory,
 ) -> tuple[Float[Array, "R n n"], Booleans]:
-    """L with L Lᵀ = Mᵀ M for M = [derivative by x0 | errors], weighted, and where it is finite."""
+    """Factor L of L Lᵀ = Mᵀ M, M = [∂y/∂x0 | errors] weighted, and where M is finite."""
     none, found = torch.zeros(0, dtype=torch.int64), u.new_zeros(len(u), W.nx + 1, W.nx + 1)
     for block in Linearisation(W, u, at).rows(none, initial_state=True, faded=FADED):
         rows = weight[:, block.time].unsqueeze(-1) * block.rows

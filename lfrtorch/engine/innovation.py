@@ -1,17 +1,17 @@
 """The innovation form of an NL-LFR, and its one-step predictor, which is an NL-LFR again.
 
-A disturbance inside the system moves the states, and the outputs tell of it::
+A disturbance inside the system moves the states, and becomes visible in the outputs::
 
     x+ = A x + Bu u + Bw w + K e
     y  = Cy x + Dyu u + Dyw w + e
 
-with innovations e that nobody can predict. Put e = y - ŷ into the first equation: the best
-prediction ŷ of the next output is the output of an NL-LFR whose inputs are u and the measured y::
+with unpredictable innovations e. Inserting e = y - ŷ into the first equation shows that the best
+prediction ŷ of the next output is the output of an NL-LFR with the inputs u and the measured y::
 
     x+ = (A - K Cy) x + (Bu - K Dyu) u + K y + (Bw - K Dyw) w
     ŷ  = Cy x + Dyu u + Dyw w
 
-Neither ŷ nor z has y at once: those columns are zeros, which a fit must leave alone. The two forms
+Neither ŷ nor z has feedthrough from y: those columns are zero, and a fit holds them. The two forms
 have the same number of parameters, and each follows from the other. An entry of A, Bu or Bw that is
 held in the system is an equation between entries of the predictor and of K.
 
@@ -32,14 +32,14 @@ from lfrtorch.engine.cell import LFRCell, Matrices
 from lfrtorch.engine.held import past_outputs
 
 TIED = {"A": "Cy", "Bu": "Dyu", "Bw": "Dyw"}
-"""Matrices of the state equation, and those that K multiplies in a predictor's."""
+"""Matrices of the state equation, each with the one that K multiplies in a predictor."""
 
 
 def predictor_cell(cell: LFRCell, K: Float[Tensor, "nx ny"]) -> LFRCell:
     """The one-step predictor of a cell with the innovation gain K: its inputs are u, then y.
 
-    What the cell holds of the other equations, so does the predictor. What it holds of A, Bu and Bw
-    is ``of_system`` there.
+    Entries of the output equations that the cell holds, the predictor holds as well. Held entries
+    of A, Bu and Bw become ``of_system`` of the predictor.
     """
     with torch.no_grad():
         K = K.to(cell.A)
@@ -78,7 +78,7 @@ def split_predictor(cell: LFRCell) -> tuple[LFRCell, Float[Tensor, "nx ny"]]:
 
 
 def _like(cell: LFRCell, nu: int) -> LFRCell:
-    """A cell of other inputs, with what both forms share; the static map is a copy."""
+    """A cell with other inputs and the matrices that both forms share; the static map is a copy."""
     A = cell.A
     sizes = nu, cell.ny, cell.nx, cell.nz, cell.nw
     found = LFRCell(*sizes, deepcopy(cell.static), device=A.device, dtype=A.dtype, random=False)

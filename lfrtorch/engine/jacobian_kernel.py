@@ -16,7 +16,7 @@ from lfrtorch.engine.simulation_kernel import matrices
 from lfrtorch.maps.machine_code import call_slope, prepared
 
 _TILE = 4
-"""Sums are over a multiple of so many terms; those that are added are zero."""
+"""Sums run over a multiple of this number of terms, filled up with zeros."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -45,7 +45,7 @@ def record_rows(
     sizes, weights, code, u, x, z, w, t0,
     x_entries, z_entries, y_entries, static, c0, c1, S, rows,
 ):  # fmt: skip
-    """Write columns c0 to c1 of the rows of a record from sample t0; S goes on to the block's end.
+    """Write columns c0 to c1 of the rows of a record from sample t0, and take S to the block's end.
 
     Entries are those of ``sensitivity.DirectTerms``.
 
@@ -59,11 +59,11 @@ def record_rows(
     x_own, z_own, y_own = (
         _between(x_entries, c0, c1), _between(z_entries, c0, c1), _between(y_entries, c0, c1)
     )  # fmt: skip
-    # Columns of the static map come after those of the matrices.
+    # Columns of the static map follow those of the matrices.
     first = len(x_entries) + len(z_entries) + len(y_entries)
     s0 = min(max(first, c0), c1)
     s1 = max(min(first + len(static), c1), s0)
-    whole = s1 - s0 == P > 0  # all weights of the map are this job's, in their order
+    whole = s1 - s0 == P > 0  # this job has all weights of the map, in their order
     # [S(k+1); dy(k)] = M(k) X(k) with X = [S; direct terms of w] and M = [F Bw; H Dyw], padded with
     # zeros to even rows and a multiple of ``_TILE`` columns. Arrays stay in place: to hand them on
     # takes as long as a product.
@@ -95,7 +95,7 @@ def record_rows(
         _add_slope(A, J, Cz, 0, M)
         _add_slope(Cy, J, Cz, nx, M)
         _product(M, X, Y)
-        # Single numbers are written long before vectors with them are read, which wait otherwise.
+        # Scalars are stored well before vector instructions load them: these would wait.
         for i in range(nx):
             for c in range(width):
                 X[i, c] = Y[i, c]
@@ -130,7 +130,7 @@ def signals(x, u, w, t, v):
         v[nx + nu + i] = w[t, i]
 
 
-# Loops for assignments of slices and masks: the latter take numba seconds to compile.
+# Loops instead of slices and masks, which take numba seconds to compile.
 @njit(nogil=True)
 def copy_to(source, target, column):
     """target[:, column:] = source."""
@@ -156,7 +156,7 @@ def _add_slope(constant, J, Cz, first, M):
 
 @njit(nogil=True)
 def _between(entries, c0, c1):
-    """The entries whose column lies between c0 and c1, counted from c0."""
+    """Entries whose columns lie between c0 and c1, counted from c0."""
     own, count = np.empty_like(entries), 0
     for n in range(len(entries)):
         if c0 <= entries[n, 0] < c1:

@@ -1,18 +1,17 @@
 """The extended Kalman filter in machine code, on square roots of covariances.
 
-The states have the error covariance P = U Uᵀ, and the noise of a sample, that of the outputs and
-then that of the states, has the covariance G Gᵀ = [R Sᵀ; S Q]. With H = ∂y/∂x at the predicted
-state, the innovation e, the states x and their noise w together have the root M::
+The states have the error covariance P = U Uᵀ. The noise of a sample, on the outputs and then on
+the states, has the covariance G Gᵀ = [R Sᵀ; S Q]. Let H = ∂y/∂x at the predicted state. The
+innovation e, the states x and their noise w together have the root M::
 
         [ e ]   [ Gy  H U ]                   [ Λ½         ]
         [ x ] : [ 0   U   ]  reflected to M = [ Lx  rest   ]
         [ w ]   [ Gw  0   ]                   [ Lw  of M   ]
 
-Reflections of the columns (QR) make the first rows lower triangular. The state that knows the
-output is then x + Lx Λ^-½ e, the noise that the output tells of is Lw Λ^-½ e, and the rest of M is
-the root of what both still may be: no covariance is ever a difference of two. With F = ∂x+/∂x at
-that state, the root of the next covariance is [F I] times the rest. An output that is missing has
-no row in M.
+Reflections of the columns (QR) make the first rows lower triangular. The state estimate given the
+output is then x + Lx Λ^-½ e, the noise estimate is Lw Λ^-½ e, and the rest of M is the root of
+their joint error covariance: no covariance is ever a difference of two. Let F = ∂x+/∂x at that
+state: the root of the next covariance is [F I] times the rest. A missing output has no row in M.
 
 References:
     Kailath, Sayed and Hassibi, "Linear Estimation", 2000, chapter 12 (array algorithms).
@@ -64,7 +63,7 @@ def correct_sample(u, y, sizes, weights, code, G, x, U, w_hat):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def advance_sample(u, sizes, weights, code, M, known, w_hat, x, U):
-    """Take x and U to the next sample, from what ``correct_sample`` returned."""
+    """Take x and U to the next sample, from the result of ``correct_sample``."""
     A, Bu, Bw, Cz, Dzu, _, _, _, phi = matrices(sizes, weights)
     nx, nw = Bw.shape
     x_next, F, by_x = np.empty(nx), np.empty((nx, nx)), np.empty((nw, nx))

@@ -15,8 +15,8 @@ from lfrtorch.engine.differentiable import Simulation
 from lfrtorch.engine.simulation import Trajectory, simulate, steady_state
 
 _UNCOMPILED: list[Any] = []
-"""The simulation as ``torch.compile`` calls it: made with the compiler's first use, which takes a
-second to import."""
+"""Simulation as ``torch.compile`` calls it, made at the first use: the compiler takes a second to
+import."""
 
 
 class LFR(nn.Module):

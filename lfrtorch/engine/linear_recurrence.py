@@ -16,7 +16,7 @@ from torch import Tensor
 from lfrtorch._support.threads import has_kernels, spread, to_numpy
 
 NOTHING = 1e-30
-"""Entries below this are set to 0; states have unit size."""
+"""Magnitude below which entries are set to 0; states have unit size."""
 
 
 def linear_recurrence(

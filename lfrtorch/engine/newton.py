@@ -19,7 +19,7 @@ from lfrtorch.engine.linearised import linearise, spectral_radius
 from lfrtorch.engine.weights import Weights
 
 MAX_NEWTON = 20
-"""Iterations after which Newton's method is given up; from a nearby trajectory it needs 3 or 4."""
+"""Iterations after which Newton's method has failed; from a nearby trajectory it needs 3 or 4."""
 
 _UPDATE_ROUNDING = 1.0
 """The states count as found after an update below this many √eps, relative to 1 + max |x|.
@@ -37,12 +37,12 @@ def newton_states(
     guess: Float[Tensor, "R T+1 nx"] | None = None,
     periodic: bool = False,
 ) -> Float[Tensor, "R T+1 nx"]:
-    """States of x(k+1) = f(x(k), u(k)), those of the loop over time to rounding.
+    """States of x(k+1) = f(x(k), u(k)), equal to those of a loop over time up to rounding.
 
-    With ``periodic`` the boundary is x(T) = x(0) instead of x(0) = x0. ``guess`` has the states of
-    a nearby trajectory from any initial state; the default is x0 at all times. A record is NaN if
-    the iteration does not converge or overflows (a model that diverges or is chaotic), or if the
-    periodic solution is not stable: no simulation would settle to it.
+    The boundary is x(0) = x0, or x(T) = x(0) if ``periodic``. ``guess`` has the states of a nearby
+    trajectory from any initial state; the default is x0 at all times. A record is NaN if the
+    iteration does not converge or overflows (a model that diverges or is chaotic), or if the
+    periodic solution is unstable, so that no simulation would settle to it.
 
     References:
         Lim, Zhu, Selfridge and Kasim, "Parallelizing non-linear sequential models over the sequence
@@ -72,7 +72,7 @@ def newton_states(
 def _open(
     F: Float[Tensor, "R T nx nx"], defect: Float[Tensor, "R T nx"], gap: Float[Tensor, "R nx"]
 ) -> tuple[Float[Tensor, "R T+1 nx"], Float[Tensor, "R nx"]]:
-    """d(k+1) = F(k) d(k) + defect(k) from d(0) = gap: all d and the last."""
+    """Solve d(k+1) = F(k) d(k) + defect(k) from d(0) = gap: all d and the last."""
     d = linear_recurrence(F, defect.unsqueeze(-1), gap.unsqueeze(-1)).squeeze(-1)
     return d, d[:, -1]
 
@@ -80,10 +80,10 @@ def _open(
 def _closed(
     F: Float[Tensor, "R T nx nx"], defect: Float[Tensor, "R T nx"], gap: Float[Tensor, "R nx"]
 ) -> tuple[Float[Tensor, "R T+1 nx"], Float[Tensor, "R nx nx"]]:
-    """The same from d(0) = d(T) + gap: all d, and the transition matrix Φ over the whole record.
+    """Solve the same from d(0) = d(T) + gap: all d, and the transition Φ over the whole record.
 
-    d(k) = Φ(k) d(0) + p(k): one recurrence has the columns of [Φ(k) p(k)], and the boundary gives
-    (I - Φ) d(0) = p(T) + gap.
+    The solution is d(k) = Φ(k) d(0) + p(k). One recurrence has the columns [Φ(k) p(k)], and the
+    boundary gives (I - Φ) d(0) = p(T) + gap.
     """
     R, _, nx = defect.shape
     identity = torch.eye(nx, dtype=F.dtype, device=F.device).expand(R, nx, nx)

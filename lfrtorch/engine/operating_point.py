@@ -20,18 +20,21 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import static_slope
 from lfrtorch.engine.simulation import simulate
 
-_MAX_NEWTON, HALVINGS = 50, 30
-"""Most steps of Newton's method, and most times that a step is halved."""
+_MAX_NEWTON = 50
+"""Most steps of Newton's method."""
+
+HALVINGS = 30
+"""Most halvings of a step of Newton's method."""
 
 _TOLERANCE = 1e-10
-"""Largest |f(x, u) - x| relative to 1 + max |x| at rest (states have unit rms)."""
+"""Largest |f(x, u) - x| at rest, relative to 1 + max |x| (states have unit rms)."""
 
 SINGULAR = 1e-12
-"""Singular values of I - F below this part of the largest are those of integrators: any of their
-states may be at rest."""
+"""Singular values of I - F below this part of the largest belong to integrators, which are at rest
+in any state."""
 
 _SETTLING = 1000
-"""Samples that a simulation has to come near its rest, if Newton's method does not find one."""
+"""Samples of the simulation that approaches an equilibrium, where Newton's method finds none."""
 
 
 class StateSpace(NamedTuple):
@@ -43,7 +46,7 @@ class StateSpace(NamedTuple):
     D: Float[Array, "ny nu"]
 
     def physical(self, scaler: Scaler) -> StateSpace:
-        """The same between signals in physical units; the states stay."""
+        """The same system between signals in physical units; the states are unchanged."""
         u, y = scaler.u_scale, scaler.y_scale[:, None]
         return StateSpace(self.A, self.B / u, y * self.C, y * self.D / u)
 
@@ -56,7 +59,7 @@ def double(cell: LFRCell) -> LFRCell:
 
 
 def linear_part(cell: LFRCell) -> StateSpace:
-    """A, Bu, Cy and Dyu: the model without its static nonlinearity."""
+    """Linear part A, Bu, Cy, Dyu: the model without its static nonlinearity."""
     A, Bu, _, _, _, Cy, Dyu, _ = cell.matrices()
     return StateSpace(A, Bu, Cy, Dyu)
 
@@ -65,7 +68,7 @@ def linear_part(cell: LFRCell) -> StateSpace:
 def linearised_at(cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"]) -> StateSpace:
     """Derivatives of the next state and the output at an input and a state.
 
-    With J = ∂w/∂z they are A + Bw J Cz, Bu + Bw J Dzu, Cy + Dyw J Cz and Dyu + Dyw J Dzu.
+    They are A + Bw J Cz, Bu + Bw J Dzu, Cy + Dyw J Cz and Dyu + Dyw J Dzu, J = ∂w/∂z.
     """
     z, _ = cell.internal(u, x)
     A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
@@ -76,10 +79,10 @@ def linearised_at(cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"
 
 @torch.no_grad()
 def equilibrium(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nx"] | None:
-    """The state at rest under a constant input; None if none is found.
+    """Equilibrium state under a constant input; None if none is found.
 
-    Newton's method begins at x = 0, and then at the end of a simulation from there. The rest may be
-    unstable, and one of several.
+    Newton's method begins at x = 0, and then at the end of a simulation from there. The equilibrium
+    may be unstable, and one of several.
     """
     x = resting_near(cell, u, u.new_zeros(cell.nx))
     if x is None:
@@ -91,7 +94,7 @@ def equilibrium(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nx"] 
 
 @torch.no_grad()
 def resting_input(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nu"] | None:
-    """The input next to u under which an integrating model is at rest, or None."""
+    """Input nearest to u under which an integrating model is at rest; None if there is none."""
     identity, x = torch.eye(cell.nx, dtype=u.dtype), u.new_zeros(cell.nx)
     for _ in range(_MAX_NEWTON):
         gap = cell(u, x)[1] - x
@@ -108,7 +111,7 @@ def resting_input(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nu"
 def resting_near(
     cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"]
 ) -> Float[Tensor, " nx"] | None:
-    """State at rest that Newton's method finds from x, or None."""
+    """Equilibrium that Newton's method finds from x; None if it finds none."""
     identity = torch.eye(cell.nx, dtype=u.dtype)
     gap = cell(u, x)[1] - x
     for _ in range(_MAX_NEWTON):

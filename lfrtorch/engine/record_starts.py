@@ -1,7 +1,7 @@
-"""How records begin: five objects, each with the state that a record begins in.
+"""Starts of records: five objects, each with its initial state.
 
-``STARTS`` has one for each name that ``Record.start`` may have. Signals are normalised, of records
-that begin alike; whoever simulates or fits asks the object, and not its name.
+``STARTS`` has one for each name of ``Record.start``. Signals are normalised, of records with the
+same start. Simulations and fits ask the object, and never compare names.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from lfrtorch.engine.simulation import Numbers, Trajectory, simulate, steady_sta
 
 
 class AtRest:
-    """``"zero"``: x = 0, at rest at the inputs' offset."""
+    """Start ``"zero"``: x = 0, at rest at the inputs' offset."""
 
     periodic = False
-    """Whether a record is a period of a steady state."""
+    """True if a record is a period of a steady state."""
     fitted = False
-    """Whether the first state is a parameter of a fit."""
+    """True if the initial state is a parameter of a fit."""
 
     def known(
         self,
@@ -28,7 +28,7 @@ class AtRest:
         y: Float[Tensor, "R T ny"],
         x0: Float[Tensor, "R nx"] | None,
     ) -> Float[Tensor, "R nx"] | None:
-        """First states that no parameter moves; None for rest, and if there are none such."""
+        """Initial states independent of all parameters; None for rest or without any."""
         return None
 
     def solved(
@@ -39,11 +39,11 @@ class AtRest:
         weight: Float[Tensor, "R T ny"],
         near: Float[Tensor, "R nx"] | None = None,
     ) -> Float[Tensor, "R nx"] | None:
-        """First states that a model and the outputs tell, from some nearby; None if known."""
+        """Initial states estimated by a model from the outputs, near given ones; None if known."""
         return None
 
     def guess(self, model: Numbers, u: Tensor, y: Tensor, weight: Tensor) -> Tensor:
-        """Where a fit begins with first states that are parameters."""
+        """Initial guess of a fit for initial states that are parameters."""
         raise NotImplementedError
 
     def trajectory(
@@ -53,44 +53,44 @@ class AtRest:
         x0: Float[Tensor, "R nx"] | None,
         near: Float[Tensor, "R _ nx"] | None = None,
     ) -> Trajectory:
-        """All signals from first states; ``near`` are states of a trajectory close by."""
+        """All signals from initial states; ``near`` has the states of a nearby trajectory."""
         return simulate(model, u, x0, guess=near)
 
 
 class Given(AtRest):
-    """``"given"``: from the state x0 of the record."""
+    """Start ``"given"``: from the state x0 of the record."""
 
     def known(self, model: Numbers, u: Tensor, y: Tensor, x0: Tensor | None) -> Tensor | None:
-        """That state."""
+        """State x0 of each record."""
         return x0
 
 
 class Measured(AtRest):
-    """``"measured"``: from the state that the first output tells, whose equation is not fitted."""
+    """Start ``"measured"``: the state determined by the first output, whose equation is held."""
 
     def known(self, model: Numbers, u: Tensor, y: Tensor, x0: Tensor | None) -> Tensor | None:
-        """The state of the first output."""
+        """State that has the first output."""
         return measured_start(model, u[:, 0], y[:, 0])
 
 
 class Estimated(AtRest):
-    """``"estimated"``: from the most probable state, given the outputs; a parameter of a fit."""
+    """Start ``"estimated"``: the most probable state given the outputs; a parameter of a fit."""
 
     fitted = True
 
     def solved(
         self, model: Numbers, u: Tensor, y: Tensor, weight: Tensor, near: Tensor | None = None
     ) -> Tensor | None:
-        """The most probable state."""
+        """Most probable state given the outputs."""
         return estimated_start(model, u, y, weight, near)
 
     def guess(self, model: Numbers, u: Tensor, y: Tensor, weight: Tensor) -> Tensor:
-        """The state that fits the beginning best."""
+        """State that fits the beginning of each record best."""
         return start_from_beginning(model, u, y, weight)
 
 
 class Periodic(AtRest):
-    """``"periodic"``: in the steady state, whose first state is its last."""
+    """Start ``"periodic"``: in periodic steady state, x(T) = x(0)."""
 
     periodic = True
 
@@ -101,7 +101,7 @@ class Periodic(AtRest):
         x0: Tensor | None,
         near: Float[Tensor, "R _ nx"] | None = None,
     ) -> Trajectory:
-        """The steady state; ``x0`` is a first guess."""
+        """Periodic steady state; ``x0`` is a first guess."""
         return steady_state(model, u, x0 if near is None else near)
 
 
@@ -109,11 +109,11 @@ STARTS: dict[str, AtRest] = {
     "zero": AtRest(), "given": Given(), "measured": Measured(), "estimated": Estimated(),
     "periodic": Periodic(),
 }  # fmt: skip
-"""By the names that records have for them."""
+"""Starts by the names that records have for them."""
 
 
 def begun(name: str, model: Numbers, u: Tensor, y: Tensor, weight: Tensor) -> Trajectory:
-    """All signals of records that a given model simulates from a start but ``"given"``."""
+    """All signals of records that a model simulates from any start but ``"given"``."""
     start = STARTS[name]
     x0 = start.known(model, u, y, None)
     x0 = start.solved(model, u, y, weight) if x0 is None else x0

@@ -1,12 +1,12 @@
 """A cell at another sampling rate: u and w are held over a sample, as in the original.
 
-With w = K z + δw, K the slope of the static map at rest, the linear part of u and δw is that of a
-continuous system whose inputs are held::
+Let w = K z + δw, K the slope of the static map at rest. The linear part, from u and δw, is then a
+continuous system with held inputs::
 
     exp(T [Ac Bc]) = [A B]        so that exp(T' [Ac Bc]) = [A B]^(T'/T)
           [0  0 ]    [0 1]                      [0  0 ]    [0 1]
 
-So the model linearised at rest is resampled exactly. The map sees z at the new samples.
+So the model linearised at rest is resampled exactly. The map is evaluated at the new samples of z.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _ROUNDING = 1e-6  # error of the logarithm, relative
 
 
 def resampled_cell(cell: LFRCell, K: Float[Array, "nw nz"], ratio: float) -> LFRCell:
-    """The cell for samples of ``ratio`` times the length.
+    """Resample a cell to samples of ``ratio`` times the length.
 
     Raises:
         ValueError: a pole at 0 or on the negative real axis: no continuous system has it.

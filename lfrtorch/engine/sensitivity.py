@@ -1,19 +1,19 @@
 """Derivatives of the simulated output with respect to every parameter of the cell.
 
-A weight changes the output in two ways. Directly: it multiplies a signal in its own equation.
-Indirectly: it changes the next state, and the model hands that change on from sample to sample.
+A weight changes the output in two ways. The direct way is its own equation, where it multiplies a
+signal. The indirect way is the next state, whose change the model propagates from sample to sample.
 The derivative S(k) of the state with respect to all parameters is therefore simulated along with
 the model, by the model linearised at every sample. That is a linear recurrence with one column for
 each parameter, and the output's derivative follows from it. A product of this Jacobian with one
 vector needs one column: forwards in time for J dθ, backwards in time for Jᵀ e (backpropagation
 through time).
 
-With v = [x; u; w] the model is linear in its matrices::
+The model is linear in its matrices, v = [x; u; w]::
 
     x+ = [A Bu Bw] v      z = [Cz Dzu 0] v      y = [Cy Dyu Dyw] v      w = f(z; φ)
 
 The direct terms of a parameter are entries of v, or derivatives of f for those of the static map.
-With these terms in G and E, and the linearised model F and H::
+They stand in G and E; F and H are the linearised model::
 
     S(k+1) = F(k) S(k) + G(k),    dy(k)/dθ = H(k) S(k) + E(k)
 
@@ -44,21 +44,23 @@ from lfrtorch.engine.weights import DirectTerms, Weights
 from lfrtorch.maps.linearised import LinearisedMap, linearise_map
 
 _FADED = 1e-18
-"""An initial state is forgotten when less than this fraction of it is left."""
+"""Part of an initial state below which it is forgotten."""
 
-BLOCK, _BLOCK_BYTES = 8192, 1 << 24
-"""Most samples, of all records together, and bytes in a block of rows on the CPU: a block that
-leaves the cache before it is used takes up to 15 % longer."""
+BLOCK = 8192
+"""Most samples, of all records together, in a block of rows on the CPU."""
+
+_BLOCK_BYTES = 1 << 24
+"""Most bytes in a block of rows on the CPU: rows that leave the cache cost up to 15 % more time."""
 
 KEPT = 1 << 16
-"""Most samples at which a compiled map is linearised once for all passes of an iteration."""
+"""Most samples for which the slopes of a compiled map are kept over all passes of an iteration."""
 
 MANY_STATES = 8
-"""Number of states from which ``blocked_rows`` is the faster kernel."""
+"""Number of states from which ``blocked_rows`` is faster than ``jacobian_rows``."""
 
 
 class Rows(NamedTuple):
-    """Rows dy/dθ of some records and samples, columns of the initial state and spare ones."""
+    """Rows dy/dθ of some records and samples, with columns of the initial state and spare ones."""
 
     records: slice
     time: slice
@@ -67,7 +69,7 @@ class Rows(NamedTuple):
 
 
 class Adjoint(NamedTuple):
-    """Derivatives of Σ e(k) · y(k); ``theta`` is each record's own."""
+    """Derivatives of Σ e(k) · y(k); ``theta`` has a row for each record."""
 
     theta: Float[Tensor, "R P"]
     u: Float[Tensor, "R T nu"]
@@ -88,9 +90,9 @@ class Linearisation:
     Args:
         model: the numbers; those of parameters with ``requires_grad=False`` are no part of θ.
         u, trajectory: input and signals of this model.
-        periodic: whether the initial state is the end state, whatever the parameters. Otherwise it
-            does not depend on them.
-        every: whether all numbers are θ.
+        periodic: the initial state is the end state, for all parameters. Otherwise it does not
+            depend on them.
+        every: all numbers are θ.
     """
 
     @torch.no_grad()
@@ -111,7 +113,7 @@ class Linearisation:
 
     @cached_property
     def free(self) -> Integers:
-        """Positions of θ among all numbers."""
+        """Positions of θ in the vector of all numbers."""
         W = self.weights
         return np.arange(len(W.flat)) if self._every else W.layout.free
 
@@ -148,10 +150,10 @@ class Linearisation:
         """Rows of dy/dθ with the initial state held, block by block.
 
         Args:
-            kept: which parameters get a column, ascending.
-            initial_state: whether nx columns for the initial state follow.
+            kept: parameters that get a column, ascending.
+            initial_state: nx columns for the initial state follow.
             spare: columns without a value at the end of the rows, for the caller to fill.
-            out: all rows, if they are to be kept; a block is then all samples of its records.
+            out: array for all rows, to keep them; a block is then all samples of its records.
             faded: derivatives of the state below which the rest of a record is left out.
         """
         columns, W = self.columns(kept), self.weights
@@ -178,7 +180,7 @@ class Linearisation:
                 S = write(records, time, columns, S, rows)
                 if initial_state and self.periodic and time.stop == T:
                     Phi[records] = S[:, :, len(kept) :]
-                    # If it has faded, fewer blocks are enough.
+                    # Once it has faded, later blocks are not needed.
                     if records.stop == R and Phi.abs().amax() >= _FADED:
                         self._known_transition = Phi, self._times
                 yield Rows(records, time, rows, S)
@@ -188,7 +190,7 @@ class Linearisation:
     def tangent(
         self, d_theta: Float[Tensor, " P"], d_x0: Float[Tensor, "R nx"] | None = None
     ) -> Float[Tensor, "R T ny"]:
-        """dy of a change dθ and of the initial state, which follows if a record is periodic."""
+        """Change dy of the output by dθ and by the initial state, which dθ implies if periodic."""
         return self.tangent_with_end(d_theta, d_x0)[0]
 
     @torch.no_grad()
@@ -198,7 +200,7 @@ class Linearisation:
         d_x0: Float[Tensor, "R nx"] | None = None,
         d_u: Float[Tensor, "R T nu"] | None = None,
     ) -> tuple[Float[Tensor, "R T ny"], Float[Tensor, "R nx"]]:
-        """dy and the change of the last state, of dθ, of the initial state and of the input."""
+        """Change of the output and of the last state by dθ, the initial state and the input."""
         start = self.state if d_x0 is None else d_x0
         if self.periodic and d_x0 is None:
             *_, (_, end) = self._changes(d_theta, start, d_u)
@@ -239,7 +241,7 @@ class Linearisation:
     def adjoint(
         self, e: Float[Tensor, "R T ny"], end: Float[Tensor, "R nx"] | None = None
     ) -> Adjoint:
-        """Derivatives of Σ e(k) · y(k), and of end · x(T) unless a record is periodic."""
+        """Gradient of Σ e(k) · y(k), and of end · x(T) unless a record is periodic."""
         W, t = self.weights, self.trajectory
         end = self._periodic_costate(e) if self.periodic else self.state if end is None else end
         theta, by_u = 0.0, []
@@ -262,10 +264,10 @@ class Linearisation:
         return Adjoint(own, torch.cat(by_u[::-1], dim=1), end)
 
     def _periodic_costate(self, e: Float[Tensor, "R T ny"]) -> Float[Tensor, "R nx"]:
-        """λ(T) = λ(0) in periodic steady state.
+        """Costate λ(T) = λ(0) of a periodic steady state.
 
-        λ(0) is what a change of the initial state does to the outputs. It takes the samples up to
-        where that change has faded, and no more.
+        The costate λ(0) is the effect of the initial state on the outputs. Samples after that
+        effect has faded are not needed.
         """
         Phi, times = self._transition
         end = self.state
@@ -276,7 +278,7 @@ class Linearisation:
 
     @property
     def _transition(self) -> tuple[Float[Tensor, "R nx nx"], list[slice]]:
-        """Φ over a whole record, and the blocks in which an initial state fades."""
+        """Transition Φ over a whole record, and the blocks in which an initial state fades."""
         if self._known_transition is not None:
             return self._known_transition
         R, nx = self.state.shape
@@ -292,21 +294,21 @@ class Linearisation:
     def _costates(
         self, block: _Block, e: Float[Tensor, "R T ny"], end: Float[Tensor, "R nx"]
     ) -> Float[Tensor, "R _ nx"]:
-        """λ(k) = F(k)ᵀ λ(k+1) + H(k)ᵀ e(k) in a block, from λ at its end."""
+        """Costates λ(k) = F(k)ᵀ λ(k+1) + H(k)ᵀ e(k) in a block, from λ at its end."""
         W, J = self.weights, block.static.J
         e = e[:, block.time]
         g = e @ W.Cy + _apply(J.mT, e @ W.Dyw) @ W.Cz  # Hᵀ e
         return states(W, J, g, end, backwards=True)
 
     def _blocks(self, *, backwards: bool = False) -> Iterator[_Block]:
-        """All records, block by block in time, or at once if they are few."""
+        """Linearised blocks of all records in time; a single block if samples are few."""
         everything = slice(0, len(self.u))
         for time in reversed(self._times) if backwards else self._times:
             yield self._block(everything, time)
 
     @cached_property
     def _whole(self) -> _Block | None:
-        """All samples, kept from one pass to the next if they are few."""
+        """Linearised model at all samples, kept from one pass to the next if samples are few."""
         R, T = self.u.shape[:2]
         return self._at(slice(0, R), slice(0, T)) if self._few else None
 
@@ -318,7 +320,7 @@ class Linearisation:
 
     @property
     def _few(self) -> bool:
-        """Whether there are so few samples that they are linearised at once."""
+        """Tell if samples are few enough to be linearised at once."""
         R, T = self.u.shape[:2]
         return (KEPT if self._compiled else PASS) >= R * T
 
@@ -353,7 +355,7 @@ class Linearisation:
     def _rows_compiled(
         self, records: slice, time: slice, columns: DirectTerms, S: Tensor, rows: Tensor
     ) -> Tensor:
-        """The same in machine code; S is never stored over time, and is changed in place."""
+        """Write the same rows in machine code; S is changed in place and never stored over time."""
         R, t = len(S), self.trajectory
         chunks = 1 if R % workers() == 0 else workers()
         signals = (np.ascontiguousarray(s.numpy()) for s in (self.u, t.x, t.z, t.w))
@@ -366,7 +368,7 @@ class Linearisation:
 
 
 def output_jacobian(linearisation: Linearisation) -> Float[Tensor, "R T ny columns"]:
-    """dy/dθ as a whole; unless the record is periodic, nx columns of the initial state follow."""
+    """Jacobian dy/dθ of all samples; unless periodic, nx columns of the initial state follow."""
     everything = torch.arange(linearisation.parameters)
     P, nx = len(everything), linearisation.weights.nx
     y = linearisation.trajectory.y
@@ -394,6 +396,6 @@ def _slices(length: int, size: int) -> Iterator[slice]:
 def fixed_point(
     transition: Float[Tensor, "R nx nx"], end: Float[Tensor, "R nx m"]
 ) -> Float[Tensor, "R nx m"]:
-    """The S with S = Φ S + end: the initial state of a period; not finite if there is none."""
+    """Solution of S = Φ S + end: the initial state of a period; not finite if there is none."""
     identity = torch.eye(end.shape[1]).to(end)
     return torch.linalg.solve_ex(identity - transition, end).result

@@ -21,26 +21,26 @@ Numbers = LFRCell | Weights
 """A model to simulate: a cell as it is, or its numbers."""
 
 PERIODIC_TOLERANCE = 1e-10
-"""Largest |x(T) - x(0)| relative to 1 + max |x| that counts as periodic (states have unit rms)."""
+"""Largest |x(T) - x(0)| that counts as periodic, relative to 1 + max |x| (states have unit rms)."""
 
 _PERIODIC_ROUNDING = 100.0
-"""The same in rounding errors, which decides in float32."""
+"""Largest |x(T) - x(0)| in rounding errors; it decides in float32."""
 
 _MET_ROUNDING = 4.0
-"""Two trajectories have met if their states differ by at most this many rounding errors."""
+"""Rounding errors within which the states of two trajectories have met."""
 
 _SETTLING_PERIODS = 3
 """Periods simulated forward before Newton's method takes over; a well damped model needs one."""
 
 _CLOSER = 1e-2
-"""The monodromy is kept if it foretells a change to this part; for Newton's method the change has
-to be below this part of the states, too."""
+"""Relative accuracy of a predicted change up to which the monodromy is kept. Newton's method begins
+below the same relative change of the states."""
 
 _MAX_PERIODS = 30
 """Most passes over the record in search of the periodic steady state."""
 
 _EXPLODED = 10.0
-"""An unstable trajectory is lost if its states exceed those of the first pass by this factor."""
+"""Growth of the states since the first pass after which an unstable trajectory is lost."""
 
 
 class Trajectory(NamedTuple):
@@ -53,7 +53,7 @@ class Trajectory(NamedTuple):
 
     @property
     def finite(self) -> bool:
-        """Whether nothing diverged."""
+        """True if no signal diverged."""
         return bool(torch.isfinite(self.y).all() and torch.isfinite(self.x[:, -1]).all())
 
 
@@ -66,9 +66,9 @@ def simulate(
 ) -> Trajectory:
     """Trajectory from the state ``x0``, by default 0; infinite or NaN samples if it diverges.
 
-    On the CPU all maps but modules of the user's run in machine code. Those, and other devices, go
-    through Newton's method over all of time, from the states ``guess`` of a nearby trajectory;
-    records for which that fails are simulated step by step.
+    On the CPU all maps but the user's modules run in machine code. User modules and other devices
+    use Newton's method over the whole trajectory, from the states ``guess`` of a nearby one.
+    Records for which that fails are simulated step by step.
     """
     W = model.weights()
     if W.layout.compiled:
@@ -85,7 +85,7 @@ def simulate(
 def simulate_near(
     model: Numbers, u: Float[Tensor, "R T nu"], x0: Float[Tensor, "R nx"], near: Trajectory
 ) -> Trajectory:
-    """``simulate``, given the trajectory from another initial state, up to where both meet."""
+    """Simulate as ``simulate`` does, up to where a trajectory from another initial state is met."""
     W = model.weights()
     if W.layout.compiled:
         return _compiled(
@@ -109,15 +109,16 @@ def steady_state(
 ) -> Trajectory:
     """Trajectory with x(T) = x(0): the response to the periodic repetition of ``u``.
 
-    In machine code the record is simulated again and again, each time from its end state, until the
-    end state is the initial state. After a few passes Newton's method on x(T) - x(0) takes over.
-    Other cells try Newton's method over all of time first. While the trajectory is unstable, as it
-    is near a rest that it leaves, the passes go on. A periodic solution that is not stable counts
-    as diverged (its record has NaN samples), unless the search begins right on it: no simulation
-    would settle to it. So does a record that has not settled after ``_MAX_PERIODS`` passes.
+    In machine code the record is simulated again and again, each time from its end state, until end
+    state and initial state agree. After a few passes Newton's method on x(T) - x(0) takes over.
+    Other cells try Newton's method over the whole trajectory first. The passes go on while the
+    trajectory is unstable, as near an equilibrium that it leaves. An unstable periodic solution, to
+    which no simulation would settle, counts as diverged unless the search begins on it: its record
+    has NaN samples. A record that has not settled after ``_MAX_PERIODS`` passes counts as diverged,
+    too.
 
     Args:
-        model: what is simulated.
+        model: the model to simulate.
         u: input, one or more whole periods.
         guess: initial state of the search, or the states of a nearby solution. Default: zero.
     """
@@ -151,7 +152,7 @@ def steady_state(
         if passes < _SETTLING_PERIODS:
             closer = end
         else:
-            # Where it foretold the change to two digits, it is kept.
+            # It is kept where it predicted the change to two digits.
             miss = (end - x0 - foretold).abs().amax(dim=1)
             near = (miss <= _CLOSER * last) & (unstable | (last <= _CLOSER * size))
             if transition is None or not near[~settled & ~lost].all():
@@ -196,8 +197,8 @@ def _compiled(
 ) -> Trajectory:
     """Trajectory in machine code.
 
-    ``near`` is the trajectory of the same model and input from another initial state, which may be
-    overwritten. Once the two have met, the rest of it is taken over.
+    ``near`` is the trajectory of the same model and input from another initial state; it may be
+    overwritten. Its rest is used from the sample at which both have met.
     """
     R, T = u.shape[:2]
     if near is None:

@@ -9,7 +9,7 @@ from lfrtorch.maps.machine_code import call_value, prepared
 
 @njit(nogil=True, inline="always")
 def matrices(sizes, weights):
-    """The matrices and the weights of the map, as views of all numbers; see ``Layout``."""
+    """Matrices and weights of the map as views of the vector of all numbers; see ``Layout``."""
     nx, nu, ny, nz, nw = sizes
     a = nx * nx
     b = a + nx * nu
@@ -37,8 +37,8 @@ def simulate_records(first, jobs, step, sizes, weights, code, u, met_within, x, 
 def simulate_record(sizes, weights, code, u, met_within, x, z, w, y):
     """Simulate a record from x[0]: write its signals over those in x, z, w and y.
 
-    It stops once a state agrees, within ``met_within``, with the one that it would overwrite: the
-    rest of the earlier trajectory then holds for this one, too. Below 0 none agrees.
+    The simulation stops once a state agrees, within ``met_within``, with the one that it would
+    overwrite: the rest of the earlier trajectory then holds. A negative value means never.
 
     Shape:
         x: (T + 1, nx), u: (T, nu), z: (T, nz), w: (T, nw), y: (T, ny).
@@ -70,7 +70,7 @@ def simulate_record(sizes, weights, code, u, met_within, x, z, w, y):
 
 @njit(nogil=True, inline="always")
 def affine(C, x, D, u, out):
-    """Out = C x + D u."""
+    """Write C x + D u into out."""
     for i in range(len(out)):
         a = 0.0
         for j in range(len(x)):

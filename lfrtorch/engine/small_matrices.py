@@ -1,6 +1,6 @@
 """Decompositions of matrices of some ten numbers, in machine code.
 
-To call LAPACK takes longer than these, and so does compiling the call.
+Calling LAPACK takes longer than these, and so does compiling the call.
 
 References:
     Demmel and Veselić, "Jacobi's method is more accurate than QR", SIAM J. Matrix Analysis and
@@ -66,7 +66,7 @@ def svd(M):
                     c += U[i, p] * U[i, q]
                 if abs(c) > eps * math.sqrt(a * b):
                     turned = True
-                    cot = (b - a) / (2.0 * c)  # of twice the angle
+                    cot = (b - a) / (2.0 * c)  # tangent of twice the angle
                     tan = math.copysign(1.0, cot) / (abs(cot) + math.sqrt(1.0 + cot * cot))
                     cos = 1.0 / math.sqrt(1.0 + tan * tan)
                     _turn(U, p, q, cos, cos * tan)

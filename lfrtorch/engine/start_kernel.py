@@ -1,7 +1,7 @@
-"""The initial state that an output tells, record by record in machine code.
+"""Estimation of initial states from outputs, record by record in machine code.
 
-``estimated_start`` in ``initial_state`` says what is computed. Gauss-Newton steps begin at a
-trajectory and write the better ones over it. ``step_of`` is one of them, for any model.
+``estimated_start`` in ``initial_state`` defines the estimate. Gauss-Newton steps begin at a
+trajectory and overwrite it with better ones. ``step_of`` is one step, for any model.
 """
 
 from __future__ import annotations
@@ -15,14 +15,20 @@ from lfrtorch.engine.simulation_kernel import affine, matrices, simulate_record
 from lfrtorch.engine.small_matrices import reflect, svd
 from lfrtorch.maps.machine_code import call_slope, prepared
 
-ITERATIONS, HALVINGS, TOLERANCE = 20, 6, 1e-8
-"""Most Gauss-Newton steps, trials in a step, and the relative decrease that ends the search."""
+ITERATIONS = 20
+"""Most Gauss-Newton steps of a search."""
+
+HALVINGS = 6
+"""Most trials in a Gauss-Newton step."""
+
+TOLERANCE = 1e-8
+"""Relative decrease of the cost that ends a search."""
 
 SEEN = 1e-9
-"""A direction of the initial state is estimated if it moves the weighted output by this much."""
+"""Least effect on the weighted output of a direction of the initial state that is estimated."""
 
 FADED = 1e-12
-"""Part of an initial state that the output cannot tell: far below ``SEEN``."""
+"""Part of an initial state that is invisible in the output: far below ``SEEN``."""
 
 PASSES = 8
 """Passes that estimate the prior's weight."""
@@ -33,12 +39,12 @@ _BLOCK = 256  # samples whose rows are folded at once
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def step_of(L, squares, x0, white, spread, variance, counted, passes, seen):
-    """A Gauss-Newton step from x0, the cost that it promises to take off, and the prior's weight.
+    """Gauss-Newton step from x0, its predicted decrease of the cost, and the prior's weight.
 
-    L = [rows left]ᵀ: the squared errors at x0 + d are |rows d + left|² and what no d changes;
-    ``squares`` are all of them at d = 0. The prior adds v |white x0|²; spread is the inverse of
-    white. v, the variance of the errors, is ``variance`` in the first pass; in each later one it is
-    that of the errors which the linear model has at the last v. Without ``passes`` there is none.
+    L = [rows left]ᵀ: the squared errors at x0 + d are |rows d + left|² plus a constant; ``squares``
+    is their sum at d = 0. The prior adds v |white x0|²; spread is the inverse of white. The error
+    variance v is ``variance`` in the first pass. Each later pass takes it from the errors of the
+    linearised model at the last v. Without ``passes`` there is no prior.
 
     Shape:
         L: (nx + 1, nx + 1), x0: (nx,), white, spread: (nx, nx).
@@ -67,7 +73,7 @@ def step_of(L, squares, x0, white, spread, variance, counted, passes, seen):
         for j in range(nx):
             whole[i, nx + 1 + j] = root * (white[j, i] if i < nx else weighted[j])
     reflect(whole, nx)
-    # A state that the output does not show stays where it is.
+    # A direction that is invisible in the output keeps its value.
     square = np.empty((nx, nx))
     for i in range(nx):
         for j in range(nx):
@@ -88,8 +94,8 @@ def fit_starts(
 ):  # fmt: skip
     """Search the initial states of the records of these jobs, from trajectories and over them.
 
-    A step that does not lower the cost is quartered. Passes of the prior double from step to step
-    up to ``PASSES``; of 0 there is no prior.
+    A step that does not lower the cost is quartered. The number of passes of the prior doubles from
+    step to step up to ``PASSES``; 0 passes mean no prior.
 
     Shape:
         u: (R, T, nu), y, weight: (R, T, ny), white, spread: (R, nx, nx), variance, counted: (R,).
@@ -135,7 +141,7 @@ def fit_starts(
 
 @njit(nogil=True, error_model="numpy")
 def _factor(sizes, weights, code, y, weight, at):
-    """Whether M = [derivative by x0 | errors], weighted, is finite, and L with L Lᵀ = Mᵀ M."""
+    """Tell if M = [∂y/∂x0 | errors], weighted, is finite, and compute L with L Lᵀ = Mᵀ M."""
     A, _, Bw, Cz, _, Cy, _, Dyw, phi = matrices(sizes, weights)
     (nx, nw), nz, (T, ny) = Bw.shape, len(Cz), y.shape
     slope, ints, constants, room = code[2], code[3], code[4], prepared(code, phi)
@@ -181,7 +187,7 @@ def _factor(sizes, weights, code, y, weight, at):
 
 @njit(nogil=True)
 def _into(source, target):
-    """Write the columns that both have."""
+    """Copy the columns that both arrays have."""
     for i in range(len(source)):
         for j in range(min(source.shape[1], target.shape[1])):
             target[i, j] = source[i, j]

@@ -1,7 +1,7 @@
 """All numbers of a model as one vector, and where each matrix and weight stands in it.
 
-What simulates and differentiates is a function of these numbers. Compiled loops take the vector as
-it is; torch takes matrices, which are views of it.
+Simulations and derivatives are functions of these numbers. Compiled loops take the vector itself;
+torch takes matrices, which are views of it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MATRICES = {
     "A": ("x", "x"), "Bu": ("x", "u"), "Bw": ("x", "w"), "Cz": ("z", "x"), "Dzu": ("z", "u"),
     "Cy": ("y", "x"), "Dyu": ("y", "u"), "Dyw": ("y", "w"),
 }  # fmt: skip
-"""The matrices in their order: which signal each adds to, and which it multiplies."""
+"""Matrices in their order, each with the signal that it adds to and the one that it multiplies."""
 
 
 Held = Mapping[str, tuple[Tensor, Tensor]]
@@ -52,7 +52,7 @@ _NO_TERMS = DirectTerms(_NOTHING, _NOTHING, _NOTHING, np.zeros(0, np.int64))
 def _places(
     sizes: tuple[int, int, int, int, int],
 ) -> tuple[dict[str, tuple[slice, tuple[int, int]]], int]:
-    """Where the matrices of a model of these sizes stand, and where they end."""
+    """Positions of the matrices of a model of these sizes, and their total length."""
     size, found, at = dict(zip("xuyzw", sizes, strict=True)), {}, 0
     for name, (left, right) in MATRICES.items():
         shape = size[left], size[right]
@@ -66,7 +66,7 @@ class Layout:
     Args:
         nx, nu, ny, nz, nw: sizes.
         static: the map.
-        parameters: names, sizes and which are free, in the order of the vector.
+        parameters: names, sizes and masks of free entries, in the order of the vector.
         state_covariance: E x xᵀ over the training data, (nx, nx); before a fit 1.
     """
 
@@ -87,11 +87,11 @@ class Layout:
         self.phi = slice(end, None)
         self._terms: dict[bytes, DirectTerms] = {}
 
-    # What follows is for derivatives alone: a simulation needs none of it.
+    # The rest is for derivatives alone; a simulation needs none of it.
 
     @cached_property
     def spans(self) -> dict[str, slice]:
-        """Where each parameter stands."""
+        """Position of each parameter."""
         found, at = {}, 0
         for name, count, _ in self._parameters:
             found[name], at = slice(at, at + count), at + count
@@ -105,7 +105,7 @@ class Layout:
 
     @cached_property
     def table(self) -> Integers:
-        """Where each number acts: its equation, its row, and the signal in v that it multiplies.
+        """Equation and row of each number, and the signal in v that it multiplies.
 
         The equations of x, z and y are 0, 1 and 2, and v = [x; u; w]. Weights of the map have
         equation 3 and their position in φ.
@@ -134,12 +134,12 @@ class Layout:
         return self._terms[key]
 
     def place(self, name: str) -> slice:
-        """Where a parameter stands; weights of the map go by their own names."""
+        """Position of a parameter; weights of the map go by their own names."""
         return self.spans[name] if name in MATRICES else self.spans[f"static.{name}"]
 
 
 class Weights:
-    """The numbers of a model: what simulates, and what derivatives are taken at.
+    """Numbers of a model, as simulations and derivatives take them.
 
     ``A``, ``Bu``, ... and ``phi`` are views of ``flat``.
     """
@@ -150,7 +150,7 @@ class Weights:
         self.map = layout.static
 
     def weights(self) -> Weights:
-        """These."""
+        """Itself, as a cell gives its own."""
         return self
 
     def __getattr__(self, name: str) -> Tensor:
@@ -163,7 +163,7 @@ class Weights:
 
     @property
     def state_covariance(self) -> Float[Tensor, "nx nx"]:
-        """E x xᵀ over the training data; before a fit 1."""
+        """Second moment E x xᵀ over the training data; before a fit 1."""
         return self.layout.state_covariance
 
     @property

@@ -1,4 +1,4 @@
-"""A model as a program of other tools, in physical units."""
+"""Export of models as programs of other tools, in physical units."""
 
 from lfrtorch.export.c_source import c_source
 from lfrtorch.export.casadi_function import casadi_function, casadi_observer, casadi_reach

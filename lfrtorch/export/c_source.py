@@ -1,4 +1,4 @@
-"""A model as C99 that needs nothing but math.h."""
+"""Export to C99 that needs nothing but math.h."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lfrtorch.model.extended_kalman_filter import NoiseCovariance
 from lfrtorch.model.model import Model
 
 _LINE = 96
-"""Most columns of a line of numbers."""
+"""Most characters of a line of numbers."""
 
 
 def c_source(
@@ -30,29 +30,30 @@ def c_source(
     """A model as C99: one step, its Jacobians, and the states to start from.
 
     ``NAME_step`` is one sample in physical units, ``NAME_jacobians`` the matrices of the model
-    linearised at a state and an input, ``NAME_reset`` the state 0, ``NAME_rest`` that at rest with
-    the inputs at their operating point, if there is one, and ``NAME_reach`` the square of the
-    surprise index, 1 as far as 99 % of the data of the fit went, if the model knows it. Sizes and
-    the sampling time are macros, as ``NAME_NX`` and ``NAME_TS``. The code allocates nothing and
-    keeps no state of its own.
+    linearised at a state and an input. ``NAME_reset`` writes the state 0, and ``NAME_rest`` the
+    state at rest with the inputs at their operating point, if there is one. ``NAME_reach`` is the
+    square of the surprise index, at most 1 for 99 % of the data of the fit, if the model knows its
+    reach. Sizes and the sampling time are macros, as ``NAME_NX`` and ``NAME_TS``. The code
+    allocates nothing and keeps no state of its own.
 
-    With an observer there are ``NAME_observer_reset``, ``NAME_observer_predict`` and
-    ``NAME_observer_update`` as well, on a struct ``NAME_observer`` of the caller, and for a
-    controller that measures y before it chooses u ``NAME_observer_correct`` and
-    ``NAME_observer_advance``.
+    An observer adds ``NAME_observer_reset``, ``NAME_observer_predict`` and
+    ``NAME_observer_update``, on a struct ``NAME_observer`` of the caller. A controller that
+    measures y before it chooses u calls ``NAME_observer_correct`` and ``NAME_observer_advance``
+    instead.
 
     Args:
-        model: what is exported.
+        model: the model to export.
         name: beginning of all names of the code.
-        observer: ``True`` for that with the model's gain K, noise for an extended Kalman filter.
-        single: whether it computes in single precision, ``float``, for a processor without double.
+        observer: ``True`` for an observer with the model's gain K, noise covariances for an
+            extended Kalman filter.
+        single: compute in single precision, ``float``, for a processor without double.
 
     Returns:
         The texts of ``NAME.h`` and ``NAME.c``.
 
     Raises:
         ValueError: a static map without equations, a name that is no identifier, or an
-            observer that the model has not.
+            observer that the model does not have.
 
     Example:
         >>> header, source = lfrtorch.export.c_source(model, "actuator")
@@ -77,7 +78,7 @@ _C = {
     "sign": "{0} > 0.0 ? 1.0 : ({0} < 0.0 ? -1.0 : 0.0)", "maximum": "{0} >= {1} ? {0} : {1}",
     "minimum": "{0} <= {1} ? {0} : {1}", "and": "{0} && {1}", "or": "{0} || {1}", "not": "!{0}",
 }  # fmt: skip
-"""Operations of formulas in C; what is true is 1.0."""
+"""Operations of formulas in C; true is 1.0."""
 
 
 def _slopes(f: Formula) -> Formula:
@@ -87,8 +88,8 @@ def _slopes(f: Formula) -> Formula:
 
 
 def _single(text: str) -> str:
-    """C of double precision as one of single precision; comments stay."""
-    # tgmath.h has exp, sqrt, .. of the type of what they are given.
+    """Convert C of double precision to single precision; comments stay."""
+    # tgmath.h has exp, sqrt, .. of the type of their argument.
     text = text.replace("#include <math.h>", "#include <tgmath.h>")
     parts = re.split(r"(/\*.*?\*/)", text, flags=re.DOTALL)
     for i in range(0, len(parts), 2):
@@ -99,7 +100,7 @@ def _single(text: str) -> str:
 
 
 def _constant(name: str, size: str, value: Array) -> str:
-    """A vector or a matrix, row by row."""
+    """Definition of a vector or a matrix, row by row."""
     rows = [[repr(float(number)) for number in row] for row in np.atleast_2d(value)]
     return f"static const double {name}[{size}] = {_braces(rows)};"
 
@@ -124,12 +125,12 @@ def _braces(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _comment(lines: Sequence[str]) -> str:
-    """Lines as a comment."""
+    """Turn lines into a comment."""
     return "\n".join(["/*", *(f" * {_plain(line)}".rstrip() for line in lines), " */"])
 
 
 def _plain(text: str) -> str:
-    """A text that neither ends a comment of C nor begins one."""
+    """Change a text so that it neither ends nor begins a comment of C."""
     for pair in ("*/", "/*", "??"):
         text = text.replace(pair, " ".join(pair))
     return text

@@ -1,4 +1,4 @@
-"""A model as a function of CasADi, made of its own expressions."""
+"""Export to functions of CasADi, made of its own expressions."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from lfrtorch.model.model import Model
 
 
 def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
-    """One sample of a model as a ``casadi.Function`` (x, u) -> (x_next, y), physical units.
+    """Sample of a model as a ``casadi.Function`` (x, u) -> (x_next, y), physical units.
 
     It is a graph of scalars (SX) without calls of Python, so that CasADi has derivatives of any
-    order, can print it as C, and solvers may run it in threads. CasADi itself fills a vector with a
-    number that is given in its place, and refuses other sizes.
+    order, can print it as C, and solvers may run it in threads. CasADi expands a number that is
+    given in place of a vector, and refuses other sizes.
 
     Args:
-        model: what is exported.
-        name: of the function.
+        model: the model to export.
+        name: name of the function.
 
     Shape:
         x: (nx,), u: (nu,) -> x_next: (nx,), y: (ny,).
@@ -54,13 +54,13 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
 
 
 def casadi_reach(model: Model, name: str = "model") -> Any:
-    """How far an operating point is from the data of the fit, as a ``casadi.Function``.
+    """Distance of an operating point from the data of the fit, as a ``casadi.Function``.
 
     ``NAME_reach`` is (x, u) -> (reach), the square of the surprise index: 99 % of the data are
     within 1, and beyond the model extrapolates. So ``reach <= 1`` is a smooth constraint.
 
     Args:
-        model: what ``lfrtorch.identify`` or ``Model.reaching`` returned.
+        model: result of ``lfrtorch.identify`` or ``Model.reaching``.
         name: first part of the function's name.
 
     Raises:
@@ -87,28 +87,29 @@ def casadi_reach(model: Model, name: str = "model") -> Any:
 def casadi_observer(
     model: Model | LinearModel, name: str = "model", *, observer: bool | NoiseCovariance = True
 ) -> tuple[Any, Any, Any]:
-    """An observer of a model as three ``casadi.Function``, physical units.
+    """Observer of a model as three ``casadi.Function``, physical units.
 
     ``NAME_predict`` is (x, u) -> (y_hat). ``NAME_update`` is (x, u, y, missing) -> (x_next) with
     the gain K, and (x, u, y, missing, P) -> (x_next, P_next) of an extended Kalman filter.
-    ``NAME_correct`` takes the same and gives the state and P that know the output of this sample,
-    from which a controller chooses u; ``update`` then takes the x and P of before. With the gain K
-    the state stays. Without feedthrough the u of ``correct`` does not matter.
+    ``NAME_correct`` takes the same and gives the state and P updated by the output of this sample,
+    from which a controller chooses u; ``update`` then takes the earlier x and P. A constant gain K
+    leaves the state unchanged. The u of ``correct`` does not matter without feedthrough.
 
-    An output is left out if its ``missing`` is 1; by default none is. A P that is left out, or NaN,
-    is the covariance of the states over the training data: where a filter begins. The covariance
-    is updated in Joseph's form.
+    An output is ignored if its ``missing`` is 1; by default none is. A P that is omitted, or NaN,
+    is the covariance of the states over the training data, with which a filter begins. The
+    covariance is updated in Joseph's form.
 
     Args:
-        model: what is exported.
+        model: the model to export.
         name: first part of the functions' names.
-        observer: ``True`` for that with the model's gain K, noise for an extended Kalman filter.
+        observer: ``True`` for an observer with the model's gain K, noise covariances for an
+            extended Kalman filter.
 
     Shape:
         x: (nx,), P: (nx, nx), u: (nu,), y, missing: (ny,).
 
     Raises:
-        ValueError: as ``casadi_function``, and for an observer that the model has not.
+        ValueError: as ``casadi_function``, and for an observer that the model does not have.
 
     Example:
         >>> noise = lfrtorch.NoiseCovariance(Q=1e-4, R=1e-2)
@@ -189,22 +190,22 @@ class _Expressions:
         return self.total("", {W: v}, b)
 
     def each(self, sigma: Formula, v: Any) -> Any:
-        """A function of one number, of every entry of v."""
+        """Apply a scalar function to every entry of v."""
         return sigma.evaluated([v], self.operations, self.ca.SX)[0]
 
     def table(self, formula: Formula, v: Any) -> Any:
-        """A function of the entries of v."""
+        """Apply a table of operations to the entries of v."""
         entries = self.ca.vertsplit(v)
         return self.ca.vertcat(*formula.evaluated(entries, self.operations, self.ca.SX))
 
 
 def _operations(ca: Any) -> dict[str, Any]:
-    """Those of formulas, of single expressions or of columns."""
+    """Operations of formulas, for scalar expressions or columns."""
     same = "sqrt exp log sin cos tan asin acos atan atan2 sinh cosh tanh sign"
     return {name: getattr(ca, name) for name in same.split()} | {
         "add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv,
         "neg": operator.neg, "pow": ca.power,
-        "sigmoid": lambda v: 0.5 + 0.5 * ca.tanh(0.5 * v),  # derivatives do not overflow either
+        "sigmoid": lambda v: 0.5 + 0.5 * ca.tanh(0.5 * v),  # its derivatives do not overflow either
         "relu": lambda v: ca.fmax(v, 0.0), "abs": ca.fabs, "where": ca.if_else,
         "softplus": lambda v: ca.fmax(v, 0.0) + ca.log1p(ca.exp(-ca.fabs(v))),
         "maximum": ca.fmax, "minimum": ca.fmin, "lt": ca.lt, "le": ca.le, "gt": ca.gt, "ge": ca.ge,

@@ -1,4 +1,4 @@
-"""A model as a system of python-control, and as the Python code that makes one."""
+"""Export to a system of python-control, and to the Python code that makes one."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _NUMPY = {
     "minimum": "np.minimum({0}, {1})", "and": "np.logical_and({0}, {1})",
     "or": "np.logical_or({0}, {1})", "not": "np.logical_not({0})",
 }  # fmt: skip
-"""Operations of formulas in numpy, whose numbers may be infinite; of numbers or of arrays."""
+"""Operations of formulas in numpy, on numbers or arrays, which may be infinite."""
 
 
 def control_system(model: Model | LinearModel, name: str = "model") -> Any:
-    """A model as a ``control.NonlinearIOSystem`` in discrete time, physical units.
+    """System of a model as a ``control.NonlinearIOSystem`` in discrete time, physical units.
 
-    Dots in channel names, which that package does not allow, become underscores; of two names that
-    are the same then, the second one has one more.
+    Dots in channel names, which that package does not allow, become underscores. The second of two
+    names that are then equal gets one more.
 
     Args:
-        model: what is exported.
-        name: of the system.
+        model: the model to export.
+        name: name of the system.
 
     Raises:
         ValueError: control is not installed, a static map without equations, or a name that
@@ -54,11 +54,11 @@ def control_system(model: Model | LinearModel, name: str = "model") -> Any:
 
 
 def python_source(model: Model | LinearModel, name: str = "model") -> str:
-    """Code of Python that needs numpy alone: ``step(x, u)``, and ``system()`` for control.
+    """Python code that needs numpy alone: ``step(x, u)``, and ``system()`` for control.
 
     Args:
-        model: what is exported.
-        name: of the system.
+        model: the model to export.
+        name: name of the system.
 
     Raises:
         ValueError: a static map without equations, or a name that is no identifier.

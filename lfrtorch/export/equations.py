@@ -1,4 +1,4 @@
-"""The equations of a model in physical units: what every export writes down."""
+"""Equations of a model in physical units, as all exports write them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Signals(Vectors, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """A model with u and y as measured and x in the coordinates of the model::
+    """Equations with u and y as measured and x in the coordinates of the model::
 
         v  = u - u_offset
         x+ = A  x + Bu  v + Bw  w
@@ -56,12 +56,12 @@ class Equations:
         matrices: A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw; nz = nw = 0 of a linear model.
         u_offset, y_offset: operating point.
         x_rest: state at rest under u_offset, (nx,); empty if none was found. x = 0 is near it.
-        map: f; nz = nw = 0 of a linear model.
-        written: f as the exports write it.
+        map: f; nz = nw = 0 for a linear model.
+        written: f in the form for exports.
         weights: the arrays of ``written``.
         fs: sampling frequency in Hz.
         inputs, outputs: channel names and units.
-        reach: how far the data of the fit went; None if that is not known.
+        reach: range of the data of the fit; None if it is not known.
     """
 
     name: str
@@ -79,19 +79,19 @@ class Equations:
 
     @property
     def arrays(self) -> dict[str, Array]:
-        """All numbers of the model by name, in the order in which the equations have them."""
+        """Numbers of the model by name, in the order of the equations."""
         offsets = {"u_offset": self.u_offset, "y_offset": self.y_offset, "x_rest": self.x_rest}
         return offsets | self.matrices._asdict() | dict(self.weights)
 
     @property
     def sizes(self) -> dict[str, int]:
-        """nx, nu, ny, nz and nw."""
+        """Sizes nx, nu, ny, nz and nw."""
         (nz, nx), (ny, nw) = self.matrices.Cz.shape, self.matrices.Dyw.shape
         return {"nx": nx, "nu": len(self.u_offset), "ny": ny, "nz": nz, "nw": nw}
 
     @property
     def feedthrough(self) -> bool:
-        """Whether an output depends on an input at the same sample."""
+        """True if an output depends on an input at the same sample."""
         M = self.matrices
         return bool(M.Dyu.any()) or bool(M.Dyw.any() and M.Dzu.any())
 
@@ -134,9 +134,9 @@ class Equations:
 
     @property
     def distance(self) -> tuple[Array, Array] | None:
-        """T and t of |T z - t|², the square of the surprise index: 1 is as far as 99 % of the data.
+        """T and t of |T z - t|², the square of the surprise index: at most 1 for 99 % of the data.
 
-        None if it is not known, or the model is linear.
+        It is None if the reach is not known, or the model is linear.
         """
         if self.reach is None or not self.map.nw:
             return None
@@ -177,7 +177,7 @@ class Equations:
 def _signals(
     place: str, letter: str, channels: Sequence[Channel], offset: Array, ends: Array | None
 ) -> list[str]:
-    """A line for each channel: its place, name, unit, operating point and range in the data."""
+    """Describe each channel on a line: place, name, unit, operating point and range in the data."""
     lines = [
         f"{place.format(letter, i, i + 1)}: {channel}, operating point {number:.6g}"
         for i, (channel, number) in enumerate(zip(channels, offset, strict=True))
@@ -191,7 +191,7 @@ def _signals(
 
 
 def printable(text: str) -> str:
-    """A text in one line: names of channels come from files."""
+    """Put a text on one line: names of channels come from files."""
     return "".join(sign if sign.isprintable() else " " for sign in text)
 
 
@@ -241,7 +241,7 @@ def equations(
 
 
 def numbers(weight: Tensor) -> Array:
-    """A weight as an array of float64."""
+    """Convert a weight to an array of float64."""
     return weight.detach().cpu().double().numpy()
 
 
@@ -277,7 +277,7 @@ _RESERVED = {
     "case", "catch", "classdef", "else", "elseif", "end", "function", "otherwise", "parfor",
     "persistent", "spmd", "switch", "hess", "jac", "null",
 }  # fmt: skip
-"""Keywords of MATLAB and CasADi, in addition to Python's."""
+"""Keywords of MATLAB and CasADi, in addition to those of Python."""
 
 
 def check_name(name: str) -> None:

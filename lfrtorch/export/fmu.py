@@ -1,4 +1,4 @@
-"""A model as a functional mock-up unit, FMI 2.0 or 3.0 for co-simulation, compiled from its C."""
+"""Export to a functional mock-up unit for co-simulation, FMI 2.0 or 3.0, compiled from its C."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ def write_fmu(
 
     Inputs, outputs and states are real variables with the channels' names and units; the states can
     be set before the simulation starts. The model samples its inputs every 1 / fs seconds and holds
-    its outputs in between: a communication step may have any size. At a sample an output is that of
-    the state and the inputs when it is read. The whole state can be saved, restored and serialized,
-    outputs have directional derivatives by inputs and states, and the description lists the inputs
-    that each output depends on.
+    its outputs in between: a communication step may have any size. At a sample an output
+    follows from the state and from the inputs at the time of reading. The whole state can be
+    saved, restored and serialized. Outputs have directional derivatives by inputs and states, and
+    the description lists the inputs of each output.
 
     Args:
-        model: what is exported.
+        model: the model to export.
         path: the file.
-        name: of the model in it.
-        version: 2 or 3, of FMI.
+        name: name of the model in it.
+        version: version of FMI, 2 or 3.
 
     Raises:
         ValueError: no C compiler, another machine than Linux on x86_64, a static map
@@ -78,7 +78,7 @@ def fmu(model: Model | LinearModel, name: str, version: int) -> bytes:
 
 
 def _compiled(files: dict[str, str], name: str) -> bytes:
-    """The shared library of the sources."""
+    """Compile the sources to a shared library."""
     machine = platform.system(), platform.machine()
     if machine != ("Linux", "x86_64"):
         raise InputError(
@@ -91,7 +91,7 @@ def _compiled(files: dict[str, str], name: str) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         for file, text in files.items():
             (Path(folder) / file).write_text(text, encoding="utf-8")
-        # Functions of the same name in other libraries do not take the place of these.
+        # Functions of the same name in other libraries do not replace these.
         options = ["-std=c99", "-O2", "-fPIC", "-shared", "-Wl,-Bsymbolic"]
         sources = [file for file in files if file.endswith(".c")]
         command = [compiler, *options, "-o", "made.so", *sources, "-lm"]
@@ -113,7 +113,7 @@ def _variables(e: Equations) -> list[tuple[str, str, str, float | None]]:
     named: dict[str, tuple[str, str, str, float | None]] = {}
     for label, symbol, causality, start in found:
         only = printable(label)
-        while only in named:  # an output may be called as an input is
+        while only in named:  # an output may have the name of an input
             only += "_"
         named[only] = only, printable(symbol), causality, start
     return list(named.values())

@@ -1,4 +1,4 @@
-"""A model as functions of MATLAB and Octave with its matrices in a file."""
+"""Export to functions of MATLAB and Octave, with the matrices in a file."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from lfrtorch.model.model import Model
 def matlab_function(
     model: Model | LinearModel, name: str = "model", *, observer: bool | NoiseCovariance = False
 ) -> tuple[dict[str, str], dict[str, Any]]:
-    """A model as functions of MATLAB and Octave.
+    """Functions of a model for MATLAB and Octave.
 
     ``[x_next, y, A, B, C, D] = NAME(x, u)`` is one sample in physical units; A, B, C and D are the
     matrices of the model linearised there. Its numbers are in ``NAME_numbers.m``, so that it may
     stand in a MATLAB Function block and code can be generated. ``[A, B, C, D, p] = NAME_lpv(x, u)``
-    has the matrices of the exact LPV form, ``lfrtorch.analysis.lpv(model)``. What
-    ``scipy.io.savemat`` writes to ``NAME.mat`` has all matrices of the model, offsets, names and
-    units of the channels, fs, the state ``x_rest`` at rest under the inputs' offsets (empty if
-    there is none), and in ``lpv`` the matrices of the LPV form (the third index counts them) and
-    its bounds.
+    has the matrices of the exact LPV form, ``lfrtorch.analysis.lpv(model)``. The variables of
+    ``NAME.mat``, for ``scipy.io.savemat``, are all matrices of the model, offsets, names and units
+    of the channels, fs, and the state ``x_rest`` at rest under the inputs' offsets (empty if there
+    is none). ``lpv`` has the matrices of the LPV form (the third index counts them) and its bounds.
 
-    With an observer there are ``s = NAME_start()``, ``s = NAME_correct(s, u, y)`` and
-    ``s = NAME_advance(s, u)`` as well: s.x is its state, and s.P the covariance of its error.
+    An observer adds ``s = NAME_start()``, ``s = NAME_correct(s, u, y)`` and
+    ``s = NAME_advance(s, u)``: s.x is its state, and s.P the covariance of its error.
 
     Args:
-        model: what is exported.
-        name: of the function.
-        observer: ``True`` for that with the model's gain K, noise for an extended Kalman filter.
+        model: the model to export.
+        name: name of the function.
+        observer: ``True`` for an observer with the model's gain K, noise covariances for an
+            extended Kalman filter.
 
     Returns:
         The texts of the functions by the names of their files, and the variables of ``NAME.mat``.
 
     Raises:
         ValueError: a static map that is no network and no polynomial, a name that is no
-            identifier, or an observer that the model has not.
+            identifier, or an observer that the model does not have.
 
     Example:
         >>> texts, variables = lfrtorch.export.matlab_function(model, "actuator")
@@ -86,7 +86,7 @@ def matlab_function(
 
 
 def _literal(M: Array) -> str:
-    """A matrix, read back to the same bits."""
+    """Literal of a matrix, which is read back to the same bits."""
     if not M.size:
         return f"zeros({len(M)}, {M.shape[1]})"
     rows = ("    " + " ".join(repr(float(v)) for v in row) for row in M)

@@ -1,4 +1,4 @@
-"""A model as graphs of ONNX in float64: one sample, and a whole simulation."""
+"""Export to graphs of ONNX in float64: one sample, and a whole simulation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lfrtorch.model.model import Model
 
 
 def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, Any]:
-    """A model as two graphs of ONNX, float64 and physical units.
+    """Graphs of a model for ONNX, two in float64 and physical units.
 
     The first is one sample, (x, u) -> (x_next, y). The second is a simulation, (x0, u) ->
     (x_end, y), by the operator Scan over the samples. Both take several states and inputs at once,
@@ -31,8 +31,8 @@ def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, A
     the channels as JSON.
 
     Args:
-        model: what is exported.
-        name: of the graphs.
+        model: the model to export.
+        name: name of the graphs.
 
     Shape:
         sample: x (n, nx), u (n, nu) -> x_next (n, nx), y (n, ny);
@@ -73,7 +73,7 @@ def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, A
 
 
 def _own(static: Module, nz: int) -> Written:
-    """A map without equations, traced."""
+    """Trace a map without equations."""
 
     def of(graph: Any, z: str) -> str:
         return graph.spliced(traced(static, nz), "f_", z)
@@ -99,7 +99,7 @@ Ends = Mapping[str, Sequence[int | str]]
 
 
 class Graph:
-    """Nodes and constants that become a model of ONNX."""
+    """Graph of nodes and constants that becomes a model of ONNX."""
 
     def __init__(self, onnx: Any, arrays: Mapping[str, Array]) -> None:
         self.onnx, self.arrays = onnx, arrays
@@ -117,23 +117,23 @@ class Graph:
         return self.node("Sum", *products, *constant, to=to)
 
     def product(self, M: str, signal: str) -> str:
-        """An array times a signal, which is a row."""
+        """Add the product of an array and a signal, which is a row."""
         return self.node("MatMul", signal, self.constant(M, self.arrays[M].T))
 
     def affine(self, W: str, v: str, b: str = "") -> str:
-        """W v + b."""
+        """Affine map W v + b."""
         found = self.product(W, v)
         return self.node("Add", found, self.constant(b, self.arrays[b])) if b else found
 
     def each(self, sigma: Formula, v: str) -> str:
-        """A function of one number, of every entry of v."""
+        """Apply a scalar function to every entry of v."""
         return self.evaluated(sigma, [v])[0]
 
     def table(self, formula: Formula, v: str) -> str:
-        """A function of the entries of v."""
+        """Apply a table of operations to the entries of v."""
         entries = self.split("Split", v, to=[f"z{j}" for j in range(formula.inputs)], axis=-1)
         nothing = self.node("Mul", entries[0], self.number(0.0))
-        varying: set[int] = set()  # the rows that are no constants, which are shorter
+        varying: set[int] = set()  # rows that are no constants, which are shorter
         for place, row in enumerate(formula.rows):
             if row.name == "input" or varying.intersection(row.operands):
                 varying.add(place)
@@ -144,11 +144,11 @@ class Graph:
         return self.node("Concat", *results, axis=-1)
 
     def evaluated(self, formula: Formula, v: list[str]) -> list[str]:
-        """The results of a table of operations on columns or on rows."""
+        """Evaluate a table of operations on columns or on rows."""
         if any(row.name == "atan2" for row in formula.rows):
             raise InputError("ONNX has no operator for atan2, which the map calls; use atan.")
 
-        def softplus(v: str) -> str:  # the operator has no float64 in every runtime
+        def softplus(v: str) -> str:  # not every runtime has the operator in float64
             near = self.node("Exp", self.node("Neg", self.node("Abs", v)))
             rest = self.node("Log", self.node("Add", near, self.number(1.0)))
             return self.node("Add", self.node("Relu", v), rest)
@@ -157,25 +157,25 @@ class Graph:
         return formula.evaluated(v, {**apply, "softplus": softplus}, self.number)
 
     def number(self, value: float) -> str:
-        """Keep a number as a constant; its name."""
+        """Add a number as a constant; return its name."""
         return self.constant(f"number_{value!r}", np.array([[value]]))
 
     def constant(self, name: str, value: Array) -> str:
-        """Keep a constant; its name."""
+        """Add a constant; return its name."""
         self.constants[name] = self.onnx.numpy_helper.from_array(np.ascontiguousarray(value), name)
         return name
 
     def node(self, operator: str, *inputs: str, to: str = "", **options: Any) -> str:
-        """Add a node; the name of its output."""
+        """Add a node; return the name of its output."""
         return self.split(operator, *inputs, to=[to or f"v{len(self.nodes)}"], **options)[0]
 
     def split(self, operator: str, *inputs: str, to: list[str], **options: Any) -> list[str]:
-        """Add a node of several outputs; their names."""
+        """Add a node with several outputs; return their names."""
         self.nodes.append(self.onnx.helper.make_node(operator, inputs, to, **options))
         return to
 
     def spliced(self, model: Any, prefix: str, z: str) -> str:
-        """Add the nodes of a model from z to w, their names behind a prefix; the name of w."""
+        """Add the nodes of a graph from z to w, with a prefix to their names; return w's name."""
         added = self.onnx.compose.add_prefix(model, prefix).graph
         self.node("Identity", z, to=f"{prefix}z")
         self.nodes += added.node

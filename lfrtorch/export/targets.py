@@ -1,4 +1,4 @@
-"""Exports by their names on the command line."""
+"""Targets of exports by their names on the command line."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Target(NamedTuple):
     follow: str = ""
 
     def usage(self, name: str, paths: list[Path], observer: bool | NoiseCovariance) -> str:
-        """The line of a program that uses the files, the observer's if there is one."""
+        """Line of a program that uses the files, the observer's if there is one."""
         if observer is False:
             return self.use.format(name=name, path=paths[0])
         P = ", P=P" if isinstance(observer, NoiseCovariance) else ""
@@ -125,7 +125,7 @@ TARGETS = {
     "fmu": Target(partial(_fmu, version=2), "found = fmpy.simulate_fmu('{path}')"),
     "fmu3": Target(partial(_fmu, version=3), "found = fmpy.simulate_fmu('{path}')"),
 }
-"""All kinds of export."""
+"""Targets by name."""
 
 
 @typed()
@@ -142,7 +142,7 @@ def write(
     """Write a model as files of another tool.
 
     Args:
-        model: what is exported.
+        model: the model to export.
         to: ``"c"``: ``NAME.h`` and ``NAME.c``, or ``"c_float"`` in single precision;
             ``"casadi"``: ``NAME.casadi``, which ``casadi.Function.load`` reads, and
             ``NAME_channels.json`` with channels and rate;
@@ -150,13 +150,13 @@ def write(
             ``NAME.m``, ``NAME_numbers.m`` and ``NAME_lpv.m`` with ``NAME.mat``; ``"control"``:
             ``NAME.py``, whose ``system()`` is a ``control.NonlinearIOSystem``; ``"fmu"`` and
             ``"fmu3"``: ``NAME.fmu``, FMI 2.0 or 3.0.
-        folder: where to; it is made if need be.
-        name: of the files, and in them.
-        overwrite: whether files that exist may be replaced.
-        observer: of C, CasADi and MATLAB, ``True`` for the observer with the model's gain K as
-            well, or noise for an extended Kalman filter.
-        disturbance: constant disturbances are the last states, and the filter finds them, see
-            ``Model.with_disturbance``.
+        folder: folder of the files; it is made if need be.
+        name: name of the files, and in them.
+        overwrite: replace files that exist.
+        observer: for C, CasADi and MATLAB, ``True`` adds the observer with the model's gain K,
+            noise covariances an extended Kalman filter.
+        disturbance: place of constant disturbances, which become the last states and are
+            estimated by the filter, see ``Model.with_disturbance``.
 
     Returns:
         The files.
@@ -164,8 +164,8 @@ def write(
     Raises:
         ValueError: an unknown target, one whose package is not installed, a name that is no
             identifier, a file that exists, the folder of a checkpoint, a static map
-            without equations, an observer that the target or the model has not, or a disturbance
-            without noise for the filter.
+            without equations, an observer that the target or the model does not have, or a
+                disturbance without noise for the filter.
 
     Example:
         >>> [path.name for path in lfrtorch.export.write(model, "c", "made", name="actuator")]

@@ -1,4 +1,4 @@
-"""A static map without equations as a graph of ONNX, which is compared with the map."""
+"""Graph of ONNX of a static map without equations, compared with the map."""
 
 from __future__ import annotations
 
@@ -15,21 +15,24 @@ from torch.nn import Module
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.optional import imported
 
-OPSET, IR = 17, 8
-"""Operators and file format of 2022, which every runtime since then reads."""
+OPSET = 17
+"""Version of the operators, of 2022, which every runtime since then reads."""
+
+IR = 8
+"""Version of the file format that belongs to these operators."""
 
 _SAMPLES = (1, 5, 64)
-"""Numbers of inputs on which graph and map are compared."""
+"""Batch sizes for which graph and map are compared."""
 
 
 def traced(static: Module, nz: int) -> Any:
-    """The graph z (n, nz) -> w (n, nw) of a map; refuse a map that it does not compute."""
+    """Graph z (n, nz) -> w (n, nw) of a map; refuse a map that it does not reproduce."""
     onnx = imported("onnx", "onnx")
     generator = torch.Generator().manual_seed(0)
-    file: Any = io.BytesIO()  # which it takes, whatever its types say
+    file: Any = io.BytesIO()  # it accepts this, although its type hints do not
     static = deepcopy(static).eval()
     z = torch.randn(max(_SAMPLES), nz, generator=generator, dtype=torch.float64)
-    # Since torch 2.9 another exporter is the default, which needs one package more.
+    # Since torch 2.9 another exporter is the default, which needs one more package.
     older: dict[str, Any]
     older = {"dynamo": False} if "dynamo" in inspect.signature(torch.onnx.export).parameters else {}
     try:
@@ -39,13 +42,13 @@ def traced(static: Module, nz: int) -> Any:
                 static, (z,), file, input_names=["z"], output_names=["w"],
                 opset_version=OPSET, dynamic_axes={"z": {0: "n"}, "w": {0: "n"}}, **older,
             )  # fmt: skip
-    except Exception as error:  # of many classes, by what its forward does
+    except Exception as error:  # errors of many classes, depending on its forward
         raise _refused(static, f"torch.onnx.export says: {error}") from None
     if any("Python boolean" in str(one.message) for one in said):
         raise _refused(static, "Its forward branches in Python on values; use torch.where.")
     model = onnx.load_from_string(file.getvalue())
     run = imported("onnx.reference", "onnx").ReferenceEvaluator(model).run
-    # Standard deviation of the loudest of them; z is of about unit size.
+    # Largest standard deviation of the inputs; z has about unit size.
     for scale, count in zip(np.linspace(3.0, 0.0, len(_SAMPLES) + 1), _SAMPLES, strict=False):
         point = float(scale) * z[:count]
         with torch.no_grad():

@@ -8,18 +8,18 @@ from torch import Tensor
 from lfrtorch.model.known import Known, Parameter, State
 
 _EMPTY = 1e-3
-"""Least level whose outflow has a slope, V: that of a root is infinite at 0."""
+"""Least level at which the outflow has a slope, V: the slope of a root is infinite at 0."""
 
 _SPILLS = 1.0
-"""Outflow by overflow, 1/s times the level above the edge: fast beside samples of 4 s."""
+"""Rate of the overflow per level above the edge, 1/s: fast compared with samples of 4 s."""
 
 
 def cascaded_tanks() -> Known:
-    """Two tanks in a cascade, the upper one filled by a pump; levels in V.
+    """Cascaded tanks, the upper one filled by a pump; levels in V.
 
-    Both drain by a power of their level (a half after Bernoulli; hoses and a level that the sensor
-    sees from elsewhere make it another). What flows over the edge of the upper tank goes partly
-    into the lower one, and that ends at its own edge. The pump lifts nothing below some voltage.
+    Both drain by a power of their level: 1/2 after Bernoulli, changed by hoses and by the offset of
+    the sensor. The overflow of the upper tank goes partly into the lower one, whose level ends at
+    its own edge. The pump delivers nothing below some voltage.
 
     References:
         Schoukens, Mattson, Wigren and Noël, "Cascaded tanks benchmark combining soft and hard
@@ -59,14 +59,14 @@ def cascaded_tanks() -> Known:
 
 
 _STICKS = 5e-4
-"""Speed below which dry friction is no longer whole, m/s."""
+"""Speed below which dry friction is smoothed, m/s."""
 
 
 def emps() -> Known:
-    """The drive of a linear axis: a force moves a mass against viscous and dry friction.
+    """Drive of a linear axis: a force moves a mass against viscous and dry friction.
 
-    Per unit of mass, as a position alone does not tell it. The friction is another to each side,
-    which the offset and the slope with the speed describe.
+    Parameters are per unit of mass, since the position does not determine the mass. The friction
+    differs between the two directions, as the offset and the slope with the speed describe.
 
     References:
         Janot, Gautier and Brunot, "Data set and reference models of EMPS", Workshop on Nonlinear
@@ -93,25 +93,25 @@ def emps() -> Known:
 
 
 _GRAVITY = 9.81
-"""Of the earth, m/s²."""
+"""Gravitational acceleration, m/s²."""
 
 _SAMPLE = 0.01
-"""Between two samples of the flights, s."""
+"""Sampling time of the flights, s."""
 
 _THOUSAND = 1e-3
-"""Motor speeds enter in 1000 rad/s."""
+"""Unit of motor speeds in the equations, rad/s."""
 
 _HOVERING = 7.0
-"""Sum of the four at rest in the air, 1000 rad/s."""
+"""Sum of the four motor speeds in hover, 1000 rad/s."""
 
 
 def nanodrone() -> Known:
-    """A rigid body with four propellers: position, velocity, roll, pitch and yaw, body rates.
+    """Rigid body with four propellers: position, velocity, roll, pitch and yaw, body rates.
 
     The thrust along the body's vertical axis and the torques are sums of squares of the motor
-    speeds; the air damps speeds and rates, and its flow across the propellers turns the body. The
-    measured velocity is that of an estimator, so the position moves by a multiple of it. One step
-    of a sample takes the rates, and with them the attitude, at its middle.
+    speeds. Air damps speeds and rates, and its flow across the propellers turns the body. The
+    measured velocity comes from an estimator, so the position changes by a multiple of it. One step
+    over a sample uses the rates, and with them the attitude, at the middle of the sample.
 
     References:
         Mahony, Kumar and Corke, "Multirotor aerial vehicles: modeling, estimation, and control of

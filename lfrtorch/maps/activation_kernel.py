@@ -23,7 +23,7 @@ def dot(x, a, y, b, count):
 
 
 LANES = 16
-"""A hidden layer has room for a multiple of so many neurons: loops over all of it are vector
+"""Divisor of the padded number of neurons of a hidden layer: loops over all of it become vector
 instructions, twice as fast as over 15 neurons."""
 
 
@@ -32,12 +32,12 @@ def hidden(activation, nz, lanes, room, z, v):
     """σ(v) and σ'(v) of all neurons with v = Wz z + bz, after room for v, which may stay empty.
 
     Args:
-        room: Wzᵀ and bz, each of so many ``lanes``, at its beginning.
-        v: where v stands in it.
+        room: array that begins with Wzᵀ and bz, each of ``lanes`` entries a row.
+        v: position of v in it.
     """
     # The compiler turns loops over all neurons into vector instructions. σ stands in the loop that
-    # makes v: vectors that were stored in one loop and are read in the next take 20 ns to arrive.
-    # Numbers are found by their place: a view takes 2 ns to make.
+    # computes v, as vectors stored in one loop and read in the next take 20 ns to arrive. Numbers
+    # are addressed by their positions: a view takes 2 ns to make.
     if activation == TANH:
         _over(_tanh, nz, lanes, room, z, v)
     elif activation == SIGMOID:
@@ -52,7 +52,7 @@ def hidden(activation, nz, lanes, room, z, v):
 
 @njit(nogil=True, inline="always")
 def _over(sigma, nz, lanes, room, z, v):
-    """``hidden`` of one activation."""
+    """Make the loop ``hidden`` of one activation."""
     bz, h = nz * lanes, v + lanes
     s, z0 = h + lanes, z[0]
     if nz == 1:
@@ -75,8 +75,8 @@ def _over(sigma, nz, lanes, room, z, v):
             room[h + n], room[s + n] = sigma(room[v + n])
 
 
-# σ(v) and σ'(v) of one neuron; NaN stays. A division that is checked for zero would stay one
-# instruction for each neuron: callers have numpy's errors.
+# σ(v) and σ'(v) of one neuron; NaN stays. Callers set numpy's error model, as a division that is
+# checked for zero is not turned into vector instructions.
 
 
 @njit(nogil=True, inline="always")
@@ -116,7 +116,7 @@ def _softplus(v):
 
 
 def _cast(kind: Any, to: Any) -> Any:
-    """A compiled function that takes the bits of a number for one of another type."""
+    """A compiled function that reads the bits of a number as another type."""
 
     def typed(typingctx, x):
         def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -135,7 +135,7 @@ _LOWEST = -700.0
 _PER_OCTAVE = 1.0 / math.log(2.0)
 _HIGH = 6.93147180369123816490e-01  # sum: ln 2; products with small integers are exact
 _LOW = 1.90821492927058770002e-10
-_ROUNDED = 1.5 * 2.0**52  # added to a number it leaves the nearest integer in the lowest bits
+_ROUNDED = 1.5 * 2.0**52  # added to a number, it leaves the nearest integer in the lowest bits
 _ONE = 1023 << 52  # bits of 1.0
 _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9, _C10, _C11, _C12, _C13 = (
     1.0 / math.factorial(n) for n in range(2, 14)
@@ -146,7 +146,7 @@ _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9, _C10, _C11, _C12, _C13 = (
 def _exp(v):
     """exp(v) for v <= 0, to rounding: exp(v) = 2^k exp(r) with |r| <= ln(2) / 2.
 
-    Faster than the library's in a loop over neurons, as it has neither branch nor table.
+    It has neither branch nor table, and is faster than the library's exp in a loop over neurons.
     """
     v = v if v > _LOWEST else _LOWEST  # NaN, too
     t = v * _PER_OCTAVE + _ROUNDED

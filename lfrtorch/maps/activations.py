@@ -1,7 +1,7 @@
-"""The activations of a network: all that the package says of one stands in its row.
+"""Activations of a network: a row of the table has all that the package knows of one.
 
-A new one takes a row here, and its loop and its slope in ``simulation_kernel``: compiled code looks
-for changes in its own file alone, and so it cannot be part of the row.
+A new activation takes a row here, and its loop with slope in ``activation_kernel``. Compiled code
+is no part of the row, since its cache notices changes of its own file alone.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from lfrtorch.maps import activation_kernel as compiled
 from lfrtorch.maps.operations import Formula
 
 FAR = 1e100
-"""Stands for infinity: its products are finite, and every bounded σ is at its limit."""
+"""Number in place of infinity: its products are finite, and every bounded σ is at its limit."""
 
 
 @dataclass(frozen=True)
 class Activation:
-    """One σ, with h = σ(v).
+    """Activation h = σ(v).
 
     Args:
         code: the number of its machine code.
@@ -33,7 +33,7 @@ class Activation:
         slope: σ'(v) from v and h.
         mean_slope: (σ(v + d) - σ(v)) / d without cancellation, σ'(v) for d = 0, of arrays of one
             shape.
-        extremes, slope_extremes: where σ and σ' have an extreme.
+        extremes, slope_extremes: points v of the extremes of σ and of σ'.
         c: σ(v[i]) and σ'(v[i]) in C, from v and h; a v that is not a number stays one.
         matlab: σ(v) and σ'(v) in MATLAB, from v and h.
         matlab_mean_slope: lines that compute s = (σ(a) - σ(v)) / d with a = v + d; ``over(a, d)``
@@ -56,32 +56,32 @@ class Activation:
 
     @property
     def formula(self) -> Formula:
-        """σ as a table of operations."""
+        """Table of operations of σ."""
         return Formula.traced(lambda v: [(self.of_number or self.value)(v)], 1)
 
     def values(self, v: Array) -> Array:
-        """σ(v)."""
+        """Values σ(v)."""
         return self.value(torch.as_tensor(v)).numpy()
 
     def slopes(self, v: Array) -> Array:
-        """σ'(v)."""
+        """Slopes σ'(v)."""
         given = torch.as_tensor(v)
         return self.slope(given, self.value(given)).numpy()
 
     @property
     def bounded(self) -> bool:
-        """Whether σ is bounded."""
+        """True if σ is bounded."""
         return bool(np.abs(self.values(np.array([-FAR, FAR]))).max() < FAR)
 
     @property
     def slope_bounds(self) -> tuple[float, float]:
-        """Least and largest slope, and so mean slope."""
+        """Least and largest slope, which also bound mean slopes."""
         found = self.slopes(np.array([-FAR, *self.slope_extremes, FAR]))
         return float(found.min()), float(found.max())
 
 
 def _quotient(a: Array, d: Array) -> Array:
-    """a / d, and 1 for d = 0."""
+    """Quotient a / d, and 1 for d = 0."""
     return np.divide(a, d, out=np.ones_like(d), where=d != 0)
 
 

@@ -1,4 +1,4 @@
-"""Static maps of checkpoints, by what ``StaticMap.describe`` says of them."""
+"""Static maps of checkpoints, from the descriptions of ``StaticMap.describe``."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from lfrtorch.maps.polynomial import Polynomial
 def made(
     description: Any, nz: int, nw: int, dtype: torch.dtype, own: Module | None
 ) -> Module | None:
-    """The map of a description, its weights yet to be loaded; ``own`` is the user's."""
+    """Map from a description, before its weights are loaded; ``own`` is the user's module."""
     maker = MAKERS.get(description["type"]) if description else None
     return own if maker is None else maker(description, nz, nw, dtype, own)
 
 
 def foreign(description: Any) -> str | None:
-    """The class of a map in it that is the user's; None if there is none."""
+    """Class of the user's map in a description; None if there is none."""
     match description:
         case {"type": "DirectSum", "parts": list(parts)}:
             return next((name for name in map(foreign, parts) if name), None)

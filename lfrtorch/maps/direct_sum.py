@@ -1,4 +1,4 @@
-"""A static map that is several beside each other: each has inputs and outputs of its own."""
+"""Direct sum of static maps: each has inputs and outputs of its own."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class DirectSum(StaticMap):
         return [as_map(part, nz, nw) for part, (nz, nw) in pairs]
 
     def _placed(self) -> Iterator[tuple[StaticMap, slice, slice, slice]]:
-        """Each part, and where its z, w and weights stand among all."""
+        """Each part, with the positions of its z, w and weights."""
         z = w = P = 0
         for part in self.maps:
             count = sum(p.numel() for p in part.parameters())
@@ -54,7 +54,7 @@ class DirectSum(StaticMap):
             z, w, P = z + part.nz, w + part.nw, P + count
 
     def weight_shapes(self, nz: int, nw: int) -> dict[str, tuple[int, ...]]:
-        """Shapes of the weights of all parts that tell them."""
+        """Shapes of the weights of all parts that know them."""
         found: dict[str, tuple[int, ...]] = {}
         for number, (part, size) in enumerate(zip(self.parts, self.sizes_of_parts, strict=True)):
             of_part = getattr(part, "weight_shapes", None)
@@ -63,11 +63,11 @@ class DirectSum(StaticMap):
         return found
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
-        """w of z."""
+        """Output w of z."""
         return torch.cat([part(z[..., own]) for part, own, _, _ in self._placed()], dim=-1)
 
     def equations(self, z: Sequence[Any], phi: Sequence[Any]) -> Sequence[Any]:
-        """w of z and φ, single numbers each."""
+        """Output w of z and φ, single numbers each."""
         return [
             each for part, own, _, weights in self._placed()
             for each in part.equations(z[own], phi[weights])
@@ -75,7 +75,7 @@ class DirectSum(StaticMap):
 
     @property
     def meaning(self) -> str:
-        """Those of the parts."""
+        """Meanings of the parts."""
         return f"[{'; '.join(part.meaning for part in self.maps)}]"
 
     @property
@@ -86,31 +86,31 @@ class DirectSum(StaticMap):
 
     @property
     def known(self) -> Any:
-        """That of the first part."""
+        """Known model of the first part."""
         return self.maps[0].known
 
     @property
     def learned(self) -> StaticMap:
-        """The part after the known model, or all."""
+        """Part after the known model, or the whole map."""
         return self if self.known is None else self.maps[1]
 
     def describe(self) -> dict[str, Any]:
-        """The parts."""
+        """Describe the parts."""
         parts = [part.describe() for part in self.maps]
         return {"type": "DirectSum", "parts": parts, "sizes": self.sizes_of_parts}
 
     def zero_output(self) -> None:
-        """That of each part."""
+        """Zero the output of each part."""
         for part in self.maps:
             part.zero_output()
 
     def redundant(self, fed: int, ny: int | None = None) -> int:
-        """That of all parts."""
+        """Sum over the parts."""
         return sum(part.redundant(fed, ny) for part in self.maps)
 
     @property
     def symmetries(self) -> list[Symmetry]:
-        """Those of the parts."""
+        """Symmetries of the parts."""
         return [
             Symmetry(
                 each.signal,
@@ -130,7 +130,7 @@ class DirectSum(StaticMap):
 
     @property
     def outputs_have_parameters(self) -> bool:
-        """Whether a part holds an output equation with parameters of its own."""
+        """True if a part has an output equation with parameters of its own."""
         return any(part.outputs_have_parameters for part in self.maps)
 
     @property
@@ -141,7 +141,7 @@ class DirectSum(StaticMap):
     def slope(
         self, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"]
     ) -> Float[Tensor, "R T nw nz"]:
-        """∂w/∂z: the parts are blocks of the diagonal."""
+        """Slopes ∂w/∂z: the parts are blocks of the diagonal."""
         found = z.new_zeros(*z.shape[:-1], self.nw, self.nz)
         for part, own, w, weights in self._placed():
             found[..., w, own] = part.slope(z[..., own], phi[weights])
@@ -150,7 +150,7 @@ class DirectSum(StaticMap):
     def by_weight(
         self, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"]
     ) -> Float[Tensor, "R T nw P"]:
-        """∂w/∂φ: the parts are blocks of the diagonal."""
+        """Derivatives ∂w/∂φ: the parts are blocks of the diagonal."""
         found = z.new_zeros(*z.shape[:-1], self.nw, len(phi))
         for part, own, w, weights in self._placed():
             found[..., w, weights] = part.by_weight(z[..., own], phi[weights])
@@ -163,8 +163,8 @@ class DirectSum(StaticMap):
         made = [code for code in codes if code is not None]
         if len(made) < len(codes):
             return None
-        # Of each part: addresses, sizes, number of weights, and where its ints, constants and room
-        # begin.
+        # A part has its addresses, sizes, number of weights, and the beginnings of its ints,
+        # constants and room.
         heads, ints, constants = [], [], []
         first, place = 1 + 9 * len(made), 0
         room = max(part.nw * part.nz for part in self.maps)
@@ -180,7 +180,7 @@ class DirectSum(StaticMap):
 
 
 def _named(prefix: str, changes: Callable[..., dict[str, Tensor]]) -> Callable[..., Any]:
-    """The changes of a part's weights, by their names among all."""
+    """Changes of a part's weights, by their names in the sum."""
 
     def named(T: Tensor, weights: dict[str, Tensor]) -> dict[str, Tensor]:
         own = {n.removeprefix(prefix): w for n, w in weights.items() if n.startswith(prefix)}
@@ -189,7 +189,7 @@ def _named(prefix: str, changes: Callable[..., dict[str, Tensor]]) -> Callable[.
     return named
 
 
-# Arrays of unknown length are made as long as they need to be: nobody asks for their end.
+# Arrays of unknown length get any sufficient length: their end is never read.
 _LONG = 1 << 30
 
 

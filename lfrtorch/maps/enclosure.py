@@ -1,10 +1,10 @@
-"""Values and slopes that neurons cannot leave while their inputs stay in a box.
+"""Interval bounds of the values and slopes of neurons, for inputs in a box.
 
 Intervals go through the map: σ of an interval lies between its values at the ends and at the
-extremes inside, and so does σ'. This counts each neuron as if the others did not matter, and is too
-wide where large ones cancel. So the box is cut into cells: what holds in all of them holds in the
-box. In a cell about c the mean value theorem, w ∈ f(c) + J (z - c) with any J within the slopes, is
-the narrower, the smaller the cell.
+extremes inside, and so does σ'. These bounds treat neurons as independent, and are too wide where
+large ones cancel. So the box is cut into cells: bounds of all cells hold in the box. In a cell
+about c the mean value theorem, w ∈ f(c) + J (z - c) with any J within the slopes, gives the
+narrower bounds, the smaller the cell.
 
 References:
     Moore, Kearfott and Cloud, "Introduction to Interval Analysis", SIAM 2009, chapters 5 and 6.
@@ -29,7 +29,7 @@ _CELLS = 2**12
 """Most cells of a box."""
 
 _ACTIVE = np.linspace(-4.0, 4.0, 17)
-"""Values of v at which neurons get their own cells."""
+"""Largest |v| for which neurons get cells of their own."""
 
 ROUNDING = 1e-12
 """Widening of intervals, relative to the size of their ends."""
@@ -43,7 +43,7 @@ class Interval(NamedTuple):
 
     @property
     def middle(self) -> Array:
-        """(low + high) / 2."""
+        """Middle (low + high) / 2."""
         return (self.low + self.high) / 2
 
     def parts(self) -> Interval:
@@ -55,7 +55,7 @@ class Interval(NamedTuple):
 
     @property
     def radius(self) -> Array:
-        """(high - low) / 2."""
+        """Radius (high - low) / 2."""
         return (self.high - self.low) / 2
 
     def within(self, other: Interval) -> Interval:
@@ -63,19 +63,19 @@ class Interval(NamedTuple):
         return Interval(np.maximum(self.low, other.low), np.minimum(self.high, other.high))
 
     def wider(self) -> Interval:
-        """The interval, widened by more than rounding errors."""
+        """Interval widened by more than rounding errors."""
         more = ROUNDING * (np.abs(self.low) + np.abs(self.high))
         return Interval(self.low - more, self.high + more)
 
 
 class Enclosure(NamedTuple):
-    """What a map cannot leave in a box.
+    """Interval bounds of a static map over a box.
 
     Args:
-        w: its values (nw,), or w - K z.
+        w: bounds of w (nw,), or of w - K z.
         J: ∂w/∂z (nw, nz).
         centres: middles of cells of the box, (C, nz).
-        neurons: s (nn,), left (nw, nn) and right (nn, nz) of J = left diag(s) right, if it is one.
+        neurons: s (nn,), left (nw, nn) and right (nn, nz) of J = left diag(s) right, for a network.
     """
 
     w: Interval
@@ -101,7 +101,7 @@ class Layer(NamedTuple):
     def enclosure(
         self, z: Interval, a: Interval | None = None, K: Float[Array, "nw nz"] | None = None
     ) -> Enclosure:
-        """Bounds in a box z (nz,), see ``StaticMap.enclosure``."""
+        """Bounds over a box z (nz,), see ``StaticMap.enclosure``."""
         sigma = self.sigma
         Wz, bz, Ww, bw = map(to_float64, self[1:])
         K = np.zeros((len(Ww), Wz.shape[1])) if K is None else K
@@ -129,7 +129,7 @@ class Layer(NamedTuple):
     def slopes_in(
         self, v: Interval, into: Float[Array, "nz nz"], middle: Float[Array, " nz"]
     ) -> Interval:
-        """∂w/∂v in cells of v (C, nz), see ``StaticMap.slopes_in``."""
+        """Bounds of ∂w/∂v over cells of v (C, nz), see ``StaticMap.slopes_in``."""
         Wz, bz, Ww, _ = map(to_float64, self[1:])
         bz, Wz = bz + Wz @ middle, Wz @ into
         inside = _product(Wz, v)
@@ -139,12 +139,12 @@ class Layer(NamedTuple):
 
 
 def _jacobians(Wz: Float[Array, "nn nz"], Ww: Float[Array, "nw nn"], slopes: Interval) -> Interval:
-    """J = Ww diag(slopes) Wz: an entry is a sum over the neurons."""
+    """Jacobian Ww diag(slopes) Wz: an entry is a sum over the neurons."""
     return _transposed(_product(Ww, _transposed(_scaled(Wz, slopes))))
 
 
 def _product(M: Float[Array, "m k"], x: Interval) -> Interval:
-    """M x for x (.., k)."""
+    """Product M x for x (.., k)."""
     up, down = np.maximum(M, 0.0).T, np.minimum(M, 0.0).T
     return Interval(x.low @ up + x.high @ down, x.high @ up + x.low @ down)
 
@@ -162,7 +162,7 @@ def _transposed(M: Interval) -> Interval:
 def _range(
     function: Callable[[Array], Array], extremes: tuple[float, ...], v: Interval
 ) -> Interval:
-    """Values of a function in intervals: at the ends, and at the extremes inside."""
+    """Range of a function over intervals: its values at the ends and at the extremes inside."""
     ends = [function(v.low), function(v.high)]
     low, high = np.minimum(*ends), np.maximum(*ends)
     for place in extremes:

@@ -44,17 +44,17 @@ SLOPES: dict[str, Callable[..., tuple[Any, ...]]] = {
     "maximum": lambda w, a, b: (torch.where(a >= b, 1.0, 0.0), torch.where(a >= b, 0.0, 1.0)),
     "minimum": lambda w, a, b: (torch.where(a <= b, 1.0, 0.0), torch.where(a <= b, 0.0, 1.0)),
 }  # fmt: skip
-"""Partial derivatives from the result and the operands; of other operations they are 0."""
+"""Partial derivatives of operations, from result and operands; 0 for operations not listed."""
 
 
 @lru_cache(maxsize=32)
 def with_slopes(formula: Formula) -> Formula:
-    """The results and after them their derivatives by all inputs, row by row.
+    """Table of the results, followed by their derivatives by all inputs, row by row.
 
-    At an edge, as of an absolute value, the derivative is that of one side or 0.
+    At a kink, as of an absolute value, the derivative is that of one side, or 0.
     """
     table = [*formula.rows]
-    tangents: list[dict[int, Any]] = []  # of each row: its derivatives that are not 0, by input
+    tangents: list[dict[int, Any]] = []  # nonzero derivatives of each row, by input
 
     def symbol(row: int) -> Symbol:
         return Symbol(table, row)
@@ -95,12 +95,12 @@ def with_slopes(formula: Formula) -> Formula:
 def statements(
     formula: Formula, inputs: Sequence[str], texts: Mapping[str, str]
 ) -> tuple[list[tuple[str, str]], list[str]]:
-    """Names and expressions of temporaries in order, and the results, in the texts of a language.
+    """Names and expressions of temporaries in order, and the results, in the text of a language.
 
     Args:
-        formula: what is written.
-        inputs: how the language says each input.
-        texts: how it says each operation.
+        formula: the table to write.
+        inputs: text of each input in the language.
+        texts: text of each operation.
     """
     names: list[str] = []
     made: list[tuple[str, str]] = []
@@ -118,7 +118,7 @@ def statements(
 
 @lru_cache(maxsize=32)
 def machine_code(formula: Formula, *, slopes: bool = False) -> Any:
-    """A function of pointers (v, out) in machine code; ``slopes``: derivatives follow the results.
+    """Compile a function of pointers (v, out); derivatives follow the results with ``slopes``.
 
     Kernels take it as an argument, and are compiled once for all of them.
     """
@@ -130,6 +130,6 @@ def machine_code(formula: Formula, *, slopes: bool = False) -> Any:
     lines += [f"out[{i}] = {result}" for i, result in enumerate(results)]
     source = "def function(v, out):\n    " + "\n    ".join(lines) + "\n"
     known: dict[str, Any] = {"math": math}
-    exec(compile(source, "<formula>", "exec"), known)  # of operations of the table alone
+    exec(compile(source, "<formula>", "exec"), known)  # operations of the table alone
     pointer = types.CPointer(types.float64)
     return cfunc(types.void(pointer, pointer), error_model="numpy")(known["function"])

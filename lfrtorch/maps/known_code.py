@@ -1,7 +1,7 @@
 """A known model in machine code: one step of it, and its derivatives.
 
-Formulas are called by their addresses, see ``formula_code.machine_code``. Signals of v = [x; u; p]
-are in physical units, those of z and w normalised.
+Formulas are called by their addresses, see ``formula_code.machine_code``. Signals v = [x; u; p] are
+in physical units, z and w are normalised.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ DISCRETE, EULER, RK4 = range(3)
 
 
 def known_value(ints, constants, weights, z, w, room):
-    """Write w = [x+; y] of z = [x; u]; y is that after ``before`` of the substeps.
+    """Write w = [x+; y] of z = [x; u]; y is taken after ``before`` of the substeps.
 
     ``ints`` has the addresses of f and h and of both with slopes, then nx, nz, nw, the number of
     parameters, the method, the substeps and those before the output. ``constants`` has the step,
@@ -131,7 +131,7 @@ def known_slope(ints, constants, weights, z, J, by_weight, stride, room):
 
 @njit(nogil=True, error_model="numpy")
 def _chained(f, v, of_f, S, K):
-    """Evaluate f at v, and K = Fx S + [0 Fu Fp]."""
+    """Evaluate f at v, and compute K = Fx S + [0 Fu Fp]."""
     call_formula(f, v, of_f)
     nx, q = S.shape
     for i in range(len(K)):

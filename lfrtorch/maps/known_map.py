@@ -1,6 +1,6 @@
-"""A known model as a static map: w = [x(k+1); y(k)] of z = [x(k); u(k)], with its parameters.
+"""Known equations as a static map: w = [x(k+1); y(k)] of z = [x(k); u(k)], with parameters.
 
-In an LFR with fixed matrices this is the known model itself; beside it, the LFR learns.
+An LFR with fixed matrices makes this map a model; a learned map may stand beside it.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from lfrtorch.maps.operations import Formula
 from lfrtorch.maps.static_map import StaticMap
 
 METHODS = {"discrete": DISCRETE, "euler": EULER, "rk4": RK4}
-"""How a sample is made of f: its result is the next state, or its rates are integrated."""
+"""Methods of one sample: f gives the next state, or the rates, which are integrated."""
 
 
 class KnownEquations(NamedTuple):
-    """x(k+1) or dx/dt = f(x, u; p), y = h(x, u; p), in physical units.
+    """Equations x(k+1) or dx/dt = f(x, u; p), y = h(x, u; p), in physical units.
 
     Args:
         f, h: functions of [x; u; p].
-        states, parameters: their names.
-        units: of the parameters.
-        inputs: number of u.
+        states, parameters: names of x and p.
+        units: units of the parameters.
+        inputs: number of inputs u.
         method: one of ``METHODS``.
-        substeps: steps of the integration in a sample, or in half a one with ``centred``.
-        centred: whether inputs are held from half a sample before to half a sample after their
-            own; x is then the state half a sample before.
+        substeps: steps of the integration in a sample, or in half a sample with ``centred``.
+        centred: inputs are held from half a sample before to half a sample after their own; x is
+            then the state half a sample before.
     """
 
     f: Formula
@@ -71,12 +71,12 @@ class KnownEquations(NamedTuple):
 
 
 class KnownModel(StaticMap):
-    """The map of known equations, of normalised signals and parameters.
+    """Map of known equations, for normalised signals and parameters.
 
     Args:
-        equations: in physical units.
-        sample_time: in seconds.
-        device, dtype: of the weights, as in any torch module.
+        equations: the equations in physical units.
+        sample_time: sampling time in seconds.
+        device, dtype: as in any torch module, for the weights.
 
     Shape:
         p: (parameters,), in units of ``p_scale``. z: (..., nx + nu), w: (..., nx + ny). Offsets and
@@ -116,46 +116,46 @@ class KnownModel(StaticMap):
 
     @property
     def known(self) -> KnownModel:
-        """This."""
+        """Known model: this map itself."""
         return self
 
     @property
     def learned(self) -> StaticMap:
-        """Nothing."""
+        """Parts beside the known model: none."""
         return StaticMap()
 
     def describe(self) -> dict[str, Any]:
-        """The equations."""
+        """Describe the equations."""
         equations = self.physics.described()
         return {"type": "Known", "equations": equations, "sample_time": self.sample_time}
 
     @property
     def physical(self) -> dict[str, float]:
-        """The parameters in their units, by name."""
+        """Parameters in their units, by name."""
         values = (self.p * self.p_scale).detach().double().cpu().tolist()
         return dict(zip(self.physics.parameters, values, strict=True))
 
     @property
     def outputs_have_parameters(self) -> bool:
-        """Whether y depends on parameters of its own, and not through the states alone."""
+        """True if y depends on parameters directly, and not through the states alone."""
         return max(self.physics.h.used, default=0) >= self.nz
 
     @property
     def steps(self) -> tuple[float, int, int]:
-        """Seconds of one step of the integration, their number, and those before the output."""
+        """Length of an integration step in seconds, number of steps, steps before the output."""
         e = self.physics
         number = e.substeps * (1 + e.centred)
         return self.sample_time / number, number, e.substeps * e.centred
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
-        """w of z."""
+        """Output w of z."""
         v = (self.of_z[:, 0] + self.of_z[:, 1] * z).unbind(-1)
         p = [each.expand(z.shape[:-1]) for each in (self.p * self.p_scale).unbind(-1)]
         w = self._stepped(v, p, lambda formula, values: formula(*values))
         return (torch.stack(w, -1) - self.of_w[:, 0]) / self.of_w[:, 1]
 
     def equations(self, z: Sequence[Any], phi: Sequence[Any]) -> Sequence[Any]:
-        """w of z and φ, single numbers each."""
+        """Output w of z and φ, single numbers each."""
         ends = (self.of_z, self.of_w)
         of_z, of_w = (each.detach().double().cpu().tolist() for each in ends)
         v = [offset + scale * each for each, (offset, scale) in zip(z, of_z, strict=True)]
@@ -167,7 +167,7 @@ class KnownModel(StaticMap):
     def _stepped(
         self, v: Sequence[Any], p: Sequence[Any], of: Callable[[Formula, Sequence[Any]], list[Any]]
     ) -> list[Any]:
-        """[x+; y] of v = [x; u] and p in physical units; ``of`` evaluates a formula."""
+        """Compute [x+; y] of v = [x; u] and p in physical units; ``of`` evaluates a formula."""
         x, u = [*v[: self.nx]], [*v[self.nx :]]
         f, h, (step, number, before) = self.physics.f, self.physics.h, self.steps
         if self.physics.method == "discrete":
@@ -202,7 +202,7 @@ class KnownModel(StaticMap):
 
     @property
     def code(self) -> Code:
-        """The map in machine code, exact derivatives through the integration."""
+        """Map in machine code, with exact derivatives through the integration."""
         e, (step, number, before) = self.physics, self.steps
         made = [
             machine_code(each, slopes=slopes) for slopes in (False, True) for each in (e.f, e.h)
@@ -220,7 +220,7 @@ class KnownModel(StaticMap):
 
     @property
     def meaning(self) -> str:
-        """f(z) in words."""
+        """Meaning of f(z) in words."""
         return "a step of the known model"
 
     def extra_repr(self) -> str:

@@ -17,7 +17,7 @@ from lfrtorch.maps.static_map import StaticMap
 
 
 class LinearisedMap(Protocol):
-    """dw = J dz + (∂w/∂φ) dφ at every sample; φ are all weights of the map in their order."""
+    """Linearisation dw = J dz + (∂w/∂φ) dφ at every sample; φ are all weights in their order."""
 
     J: Float[Tensor, "R T nw nz"]
     """∂w/∂z."""
@@ -38,14 +38,14 @@ class LinearisedMap(Protocol):
 def linearise_map(
     static: StaticMap, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"], code: Code | None
 ) -> LinearisedMap:
-    """A map linearised at z with the weights φ; ``code`` is its own, to save finding it again."""
+    """Linearise a map at z with the weights φ; ``code`` is the map's, if it is already known."""
     if code is not None and static.nw and has_kernels(z):
         return CompiledMap(z, phi, static.nw, code)
     return TorchMap(static, z, phi)
 
 
 class TorchMap:
-    """By torch, on any device."""
+    """Linearisation by torch, on any device."""
 
     def __init__(
         self, static: StaticMap, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"]
@@ -73,7 +73,7 @@ class TorchMap:
 
 
 class CompiledMap:
-    """In machine code, which computes derivatives anew with each use: none is kept over time."""
+    """Linearisation in machine code: each use computes derivatives anew and stores none."""
 
     def __init__(
         self, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"], nw: int, code: Code
@@ -108,7 +108,7 @@ class CompiledMap:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _slopes(first, jobs, step, code, phi, z, which, out):
-    """Write ∂w/∂z (which = 0) or ∂w/∂φ (1) of all samples of every record of these jobs."""
+    """Write ∂w/∂z (``which`` = 0) or ∂w/∂φ (1) at all samples of the records of these jobs."""
     slope, ints, constants, room = code[2], code[3], code[4], prepared(code, phi)
     nw, P = out.shape[2], len(phi)
     J, none = np.empty(nw * z.shape[2]), np.empty(0)

@@ -20,16 +20,16 @@ from lfrtorch._support.types import Array, Integers
 _INTS, _DOUBLES = types.CPointer(types.int64), types.CPointer(types.float64)
 
 PREPARE = types.void(_INTS, _DOUBLES, _DOUBLES, _DOUBLES)
-"""What is done once before many values and slopes: (ints, constants, weights, room) -> None."""
+"""Type of a preparation for many values and slopes: (ints, constants, weights, room) -> None."""
 
 VALUE = types.void(_INTS, _DOUBLES, _DOUBLES, _DOUBLES, _DOUBLES, _DOUBLES)
-"""A value: (ints, constants, weights, z, w, room) -> None, which writes w (nw,)."""
+"""Type of a value: (ints, constants, weights, z, w, room) -> None, which writes w (nw,)."""
 
 SLOPE = types.void(
     _INTS, _DOUBLES, _DOUBLES, _DOUBLES, _DOUBLES, _DOUBLES, types.int64, _DOUBLES
 )  # fmt: skip
-"""A slope: (ints, constants, weights, z, J, by_weight, stride, room) -> None, which writes ∂w/∂z
-(nw, nz) and ∂w/∂weights (nw, P), whose rows are ``stride`` numbers apart; of 0 the first alone."""
+"""Type of a slope: (ints, constants, weights, z, J, by_weight, stride, room) -> None. It writes
+∂w/∂z (nw, nz) and ∂w/∂weights (nw, P) with rows ``stride`` numbers apart; 0 omits the latter."""
 
 
 class Code(NamedTuple):
@@ -39,8 +39,8 @@ class Code(NamedTuple):
         prepare, value, slope: addresses of functions of the types ``PREPARE``, ``VALUE`` and
             ``SLOPE``; 0 if there is nothing to prepare.
         ints, constants: numbers that they need beside the weights.
-        room: float64 numbers that they write to; what is prepared stays.
-        keep: what must live as long as the addresses.
+        room: number of float64 entries of their scratch array, which keeps the preparation.
+        keep: objects that must live as long as the addresses.
     """
 
     prepare: int
@@ -53,17 +53,17 @@ class Code(NamedTuple):
 
     @property
     def arguments(self) -> tuple[int, int, int, Integers, Array, int]:
-        """What a compiled loop takes."""
+        """Arguments of a compiled loop."""
         return self[:6]
 
 
 NOTHING = Code(0, 0, 0, np.zeros(0, np.int64), np.zeros(0), 0)
-"""The code of no map, which nobody calls."""
+"""Code of no map; it is never called."""
 
 
 @cache
 def address(function: Callable[..., None], signature: Any = VALUE) -> int:
-    """The address of a function, compiled with the first use and kept on disk."""
+    """Address of a function, compiled at the first use and kept on disk."""
     made = cfunc(signature, cache=True, error_model="numpy", fastmath={"contract"})(function)
     _KEPT.append(made)
     return int(made.address or 0)
@@ -74,7 +74,7 @@ _KEPT: list[Any] = []
 
 
 def _called(*names: str) -> Any:
-    """A compiled function that calls an address with the data of arrays, and a number as it is."""
+    """Compile a call of an address; arrays pass the address of their data, numbers their value."""
     whole, double = ir.IntType(64), ir.DoubleType().as_pointer()
     kinds = {"ints": whole.as_pointer(), "stride": whole}
     types_of = [kinds.get(name, double) for name in names]
@@ -115,12 +115,12 @@ call_prepare: Any = intrinsic(_prepare)
 call_value: Any = intrinsic(_value)
 call_slope: Any = intrinsic(_slope)
 call_formula: Any = intrinsic(_formula)
-"""In compiled code: call a function by its address with contiguous arrays."""
+"""Call a function by its address with contiguous arrays, in compiled code."""
 
 
 @njit(nogil=True, inline="always")
 def prepared(code, weights):
-    """The room of a map with these weights, for its values and slopes."""
+    """Scratch array of a map, prepared for its values and slopes with these weights."""
     room = np.empty(code[5])
     if code[0]:
         call_prepare(code[0], code[3], code[4], weights, room)

@@ -12,7 +12,7 @@ from lfrtorch._support.types import Array
 
 
 class Quadrature(NamedTuple):
-    """Nodes t from 0 to 1 and weights of a rule for the integral, and whether it is exact."""
+    """Rule for the integral: nodes t from 0 to 1, weights, and True if it is exact."""
 
     t: Float[Array, " n"]
     weight: Float[Array, " n"]
@@ -20,13 +20,13 @@ class Quadrature(NamedTuple):
 
     @classmethod
     def gauss_legendre(cls, nodes: int, *, exact: bool = False) -> Quadrature:
-        """Exact for slopes that are polynomials in t of a degree below twice the nodes."""
+        """Gauss-Legendre rule, exact for polynomials in t of a degree below twice the nodes."""
         t, weight = np.polynomial.legendre.leggauss(nodes)
         return cls((t + 1.0) / 2, weight / 2, exact)
 
 
 class Neurons(NamedTuple):
-    """Δ = L diag(p) R of w = L σ(R z + b) + .., with p the mean slopes of σ, neuron by neuron.
+    """Mean slope Δ = L diag(p) R of w = L σ(R z + b) + .., with the mean slopes p of the neurons.
 
     Args:
         left: L, (nw, P).
@@ -41,7 +41,7 @@ class Neurons(NamedTuple):
     mean_slopes: Callable[[Array, Array], Array]
 
     def delta(self, z0: Float[Array, " nz"], zeta: Float[Array, "S nz"]) -> Array:
-        """Δ, (S, nw, nz)."""
+        """Mean slope Δ, (S, nw, nz)."""
         return self.left @ (self.mean_slopes(z0, zeta)[..., None] * self.right)
 
     @property

@@ -1,4 +1,4 @@
-"""A network as static map: one hidden layer."""
+"""Network with one hidden layer, as a static map."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from lfrtorch.maps.written import Vectors, Written
 
 
 class Network(StaticMap):
-    """One hidden layer: w = Ww σ(Wz z + bz) + bw.
+    """Network with one hidden layer: w = Ww σ(Wz z + bz) + bw.
 
     Args:
         nz: inputs.
@@ -33,7 +33,7 @@ class Network(StaticMap):
         nn: neurons.
         activation: σ, by its name in ``lfrtorch.maps.activations``: as ``"tanh"``, ``"relu"`` or
             ``"rbf"``, exp(-v²).
-        device, dtype: of the weights, as in any torch module.
+        device, dtype: as in any torch module, for the weights.
 
     Shape:
         Wz: (nn, nz), bz: (nn,), Ww: (nw, nn), bw: (nw,).
@@ -74,7 +74,7 @@ class Network(StaticMap):
         self.reset_parameters()
 
     def reset_parameters(self, generator: torch.Generator | None = None) -> None:
-        """Wz, bz, Ww ~ U(-1, 1) and bw = 0, the draw of Schoukens and Tóth (2020)."""
+        """Draw Wz, bz, Ww ~ U(-1, 1), and set bw = 0, as Schoukens and Tóth (2020)."""
         with torch.no_grad():
             for weight in (self.Wz, self.bz, self.Ww):
                 weight.uniform_(-1.0, 1.0, generator=generator)
@@ -86,21 +86,21 @@ class Network(StaticMap):
         return {"Wz": (nn, nz), "bz": (nn,), "Ww": (nw, nn), "bw": (nw,)}
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
-        """w of z."""
+        """Output w of z."""
         return self.sigma.value(z @ self.Wz.mT + self.bz) @ self.Ww.mT + self.bw
 
     @property
     def sigma(self) -> Activation:
-        """σ."""
+        """Activation σ."""
         return ACTIVATIONS[self.activation]
 
     @property
     def sizes(self) -> dict[str, int]:
-        """nn."""
+        """Number of neurons nn."""
         return {"nn": self.bz.shape[-1]}
 
     def equations(self, z: Sequence[Any], phi: Sequence[Any]) -> Sequence[Any]:
-        """w of z and φ, single numbers each."""
+        """Output w of z and φ, single numbers each."""
         nn, sigma = self.bz.shape[-1], self.sigma.of_number or self.sigma.value
         at = iter(phi)
         Wz = [[next(at) for _ in range(self.nz)] for _ in range(nn)]
@@ -119,7 +119,7 @@ class Network(StaticMap):
 
     @property
     def symmetries(self) -> list[Symmetry]:
-        """Coordinates of z and of w."""
+        """Changes of coordinates of z and of w."""
         return [
             Symmetry("z", slice(0, self.nz), lambda T, W: {"Wz": -W["Wz"] @ T}),
             Symmetry("w", slice(0, self.nw), lambda T, W: {"Ww": T @ W["Ww"], "bw": T @ W["bw"]}),
@@ -133,7 +133,7 @@ class Network(StaticMap):
 
     @property
     def meaning(self) -> str:
-        """f(z) as an equation."""
+        """Equation of f(z)."""
         of_sigma = f", {self.sigma.meaning}" if self.sigma.meaning else ""
         return f"Ww {self.activation}(Wz z + bz) + bw{of_sigma}"
 
@@ -159,7 +159,7 @@ class Network(StaticMap):
 
     @property
     def title(self) -> str:
-        """With its activation."""
+        """Name with the activation."""
         return f"network of {self.activation}"
 
     def describe(self) -> dict[str, Any]:
@@ -168,7 +168,7 @@ class Network(StaticMap):
 
     @torch.no_grad()
     def beside(self, others: Sequence[StaticMap]) -> StaticMap | None:
-        """One network with the neurons of all, if all have the same activation."""
+        """Network with the neurons of all, if all have the same activation."""
         if any({**(other.describe() or {}), **self.sizes} != self.describe() for other in others):
             return None
         maps = [self, *others]
@@ -182,13 +182,13 @@ class Network(StaticMap):
         return found
 
     def zero_output(self) -> None:
-        """Ww = 0 and bw = 0."""
+        """Set Ww = 0 and bw = 0."""
         with torch.no_grad():
             self.Ww.zero_()
             self.bw.zero_()
 
     def redundant(self, fed: int, ny: int | None = None) -> int:
-        """Coordinates of z and w, rows of Wz for z that nothing enters, and a constant w."""
+        """Number of coordinates of z and w, rows of Wz for unused z, and a constant w."""
         nz, nn = min(self.nz, fed), self.bz.shape[-1]
         constant = 0 if ny is None else max(0, self.nw - ny)
         return self.nz * nz + nn * (self.nz - nz) + self.nw**2 + constant
@@ -200,13 +200,13 @@ class Network(StaticMap):
     def enclosure(
         self, z: Interval, a: Interval | None = None, K: Float[Array, "nw nz"] | None = None
     ) -> Enclosure:
-        """Bounds of w and its slopes in a box z (nz,)."""
+        """Bounds of w and its slopes over a box z (nz,)."""
         return self._layer.enclosure(z, a, K)
 
     def slopes_in(
         self, v: Interval, into: Float[Array, "nz nz"], middle: Float[Array, " nz"]
     ) -> Interval:
-        """What ∂w/∂v (C, nw, nz) cannot leave in cells of v (C, nz), z = into v + middle."""
+        """Bounds of ∂w/∂v (C, nw, nz) over cells of v (C, nz), z = into v + middle."""
         return self._layer.slopes_in(v, into, middle)
 
     # Closed forms, six times faster than by ``torch.func``: v = Wz z + bz, h = σ(v), s = σ'(v).
@@ -214,7 +214,7 @@ class Network(StaticMap):
     def slope(
         self, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"]
     ) -> Float[Tensor, "R T nw nz"]:
-        """∂w/∂z = Ww diag(s) Wz."""
+        """Slope ∂w/∂z = Ww diag(s) Wz."""
         Wz, bz, Ww, _ = self.named_weights(phi).values()
         v = z @ Wz.mT + bz
         s = self.sigma.slope(v, self.sigma.value(v))
@@ -225,7 +225,7 @@ class Network(StaticMap):
     def by_weight(
         self, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"]
     ) -> Float[Tensor, "R T nw P"]:
-        """∂w/∂φ: of w_q by Wz[n, j] Ww[q, n] s_n z_j, by bz[n] Ww[q, n] s_n, by Ww[q, n] h_n."""
+        """Derivatives of w_q: Ww[q, n] s_n z_j (Wz[n, j]), Ww[q, n] s_n (bz[n]), h_n (Ww[q, n])."""
         Wz, bz, Ww, _ = self.named_weights(phi).values()
         v = z @ Wz.mT + bz
         h = self.sigma.value(v)
@@ -241,8 +241,8 @@ class Network(StaticMap):
         return f"nz={nz}, nw={nw}, nn={nn}, activation={self.activation!r}"
 
 
-# The room has the weights with zeros for neurons up to a multiple of ``LANES``: Wzᵀ, bz and Ww, row
-# by row, and then v, h = σ(v) and s = σ'(v).
+# The scratch array has the weights, padded with zero neurons to a multiple of ``LANES``: Wzᵀ, bz
+# and Ww, row by row. Then follow v, h = σ(v) and s = σ'(v).
 
 
 def _prepare(ints, constants, weights, room):
@@ -277,7 +277,7 @@ def _slope(ints, constants, weights, z, J, by_weight, stride, room):
             J[q * nz + j] = dot(room, j * lanes, room, v, lanes)
         if stride == 0:
             continue
-        if nz == 1:  # strides that are known become vector instructions
+        if nz == 1:  # known strides allow vector instructions
             z0 = z[0]
             for n in range(nn):
                 by_weight[own + n] = room[v + n] * z0

@@ -1,8 +1,8 @@
 """Functions of scalars as tables of operations, which torch, kernels and exports compute.
 
-A function that is written with torch's functions is called once with symbols in the place of
-numbers, and what it does to them is written down, one operation a row. So a checkpoint holds the
-function without any code, and every export has its equations.
+A function written with torch's functions is called once with symbols in place of numbers. Its
+operations are recorded, one a row. So a checkpoint holds the function without any code, and every
+export has its equations.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Number = float | bool
 
 
 class Operation(NamedTuple):
-    """A row: the name of an operation, and its operands, numbers or earlier rows."""
+    """Row of a table: the name of an operation, and its operands."""
 
     name: str
     operands: tuple[int, ...] = ()
     """Rows, counted from 0."""
     number: float = 0.0
-    """Of a constant its value, of an input its position."""
+    """Value of a constant, position of an input."""
 
 
 def _softplus(v: Tensor) -> Tensor:
@@ -46,7 +46,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "gt": operator.gt, "ge": operator.ge, "and": torch.logical_and, "or": torch.logical_or,
     "not": torch.logical_not,
 }  # fmt: skip
-"""What a row may be, besides a constant and an input."""
+"""Operations of a row, besides constants and inputs."""
 
 _SAME = {
     "true_divide": "div", "truediv": "div", "divide": "div", "multiply": "mul", "subtract": "sub",
@@ -56,15 +56,15 @@ _SAME = {
     "logical_and": "and", "logical_or": "or", "logical_not": "not", "bitwise_and": "and",
     "bitwise_or": "or", "bitwise_not": "not", "expit": "sigmoid",
 }  # fmt: skip
-"""Other names of torch for the same."""
+"""Other names in torch of the same operations."""
 
 
 class UntraceableError(InputError):
-    """A function that is not made of ``OPERATIONS``."""
+    """Error of a function that is not composed of ``OPERATIONS``."""
 
 
 def _operator(name: str, *, swapped: bool = False) -> Callable[..., Symbol]:
-    """A method that writes an operation down."""
+    """Make a method that records an operation."""
 
     def method(self: Symbol, *others: Any) -> Symbol:
         return _row(self.table, name, (*others, self) if swapped else (self, *others))
@@ -73,7 +73,7 @@ def _operator(name: str, *, swapped: bool = False) -> Callable[..., Symbol]:
 
 
 class Symbol:
-    """A scalar in a function that is traced; everything that is done with it becomes a row."""
+    """Scalar in a traced function; every operation on it becomes a row."""
 
     def __init__(self, table: list[Operation], row: int) -> None:
         self.table, self.row = table, row
@@ -82,9 +82,9 @@ class Symbol:
     def __torch_function__(
         cls, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
     ) -> Symbol | tuple[Any, ...]:
-        """Write down a function of torch."""
+        """Record a function of torch."""
         if func.__name__ == "stack" and len(args) == 1 and not kwargs:
-            return tuple(args[0])  # as the results of a function
+            return tuple(args[0])  # numbers as results of a function
         given = _flat((*args, *(kwargs or {}).values()))
         if not given:
             raise UntraceableError(f"it calls {func.__name__} with a list; use single numbers.")
@@ -109,7 +109,7 @@ class Symbol:
         return "<a number>"
 
     def constant(self, value: float) -> Symbol:
-        """A number in the same table."""
+        """Record a number in the same table."""
         return _symbol(self.table, value)
 
     def __bool__(self) -> bool:
@@ -139,7 +139,7 @@ _DERIVED: dict[str, Callable[..., Any]] = {
     "expm1": lambda v: torch.exp(v) - 1.0, "log1p": lambda v: torch.log(1.0 + v),
     "rsub": lambda a, b: b - a, "positive": lambda v: v,
 }  # fmt: skip
-"""Functions of torch that are made of these."""
+"""Functions of torch composed of these operations."""
 
 
 def _flat(parts: Sequence[Any]) -> list[Symbol]:
@@ -149,7 +149,7 @@ def _flat(parts: Sequence[Any]) -> list[Symbol]:
 def _row(
     table: list[Operation], name: str, args: Sequence[Any], kwargs: dict[str, Any] | None = None
 ) -> Symbol:
-    """Write an operation down."""
+    """Record an operation."""
     name = name.strip("_")
     if name in _DERIVED:
         args = [_symbol(table, args[0]), *args[1:]] if name in ("clamp", "clip") else args
@@ -169,7 +169,7 @@ def _applied(table: list[Operation], name: str, *operands: Any) -> Symbol:
 
 
 def _symbol(table: list[Operation], part: Any) -> Symbol:
-    """A symbol as it is, and any number as a constant."""
+    """Return a symbol unchanged, and any number as a constant."""
     if isinstance(part, Symbol):
         return part
     try:
@@ -187,9 +187,9 @@ class Formula(NamedTuple):
     """A function of scalars v -> w.
 
     Args:
-        inputs: how many v there are; they are the first rows.
+        inputs: number of v, which are the first rows.
         rows: operations.
-        results: the rows of w.
+        results: positions of the rows of w.
     """
 
     inputs: int
@@ -198,10 +198,10 @@ class Formula(NamedTuple):
 
     @classmethod
     def traced(cls, function: Callable[..., Any], inputs: int) -> Formula:
-        """The table of a function of so many scalars that returns scalars.
+        """Table of a function of ``inputs`` scalars that returns scalars.
 
         Raises:
-            UntraceableError: it does what no table has.
+            UntraceableError: the function has operations that no table has.
         """
         table = [Operation("input", number=float(i)) for i in range(inputs)]
         found = function(*(Symbol(table, i) for i in range(inputs)))
@@ -211,7 +211,7 @@ class Formula(NamedTuple):
         return cls(inputs, tuple(table), results).pruned()
 
     def pruned(self) -> Formula:
-        """Without rows that no result needs, and each row once."""
+        """Remove duplicates and rows that no result needs."""
         needed, stack = set(range(self.inputs)), [*self.results]
         while stack:
             if (row := stack.pop()) not in needed:
@@ -227,14 +227,14 @@ class Formula(NamedTuple):
 
     @property
     def used(self) -> set[int]:
-        """The inputs that a result depends on, of a table without rows that none needs."""
+        """Inputs on which a result of a pruned table depends."""
         rows = {i for row in self.rows for i in row.operands} | {*self.results}
         return {i for i in rows if i < self.inputs}
 
     def evaluated(
         self, inputs: Sequence[Any], operations: dict[str, Callable[..., Any]], constant: Any
     ) -> list[Any]:
-        """The results by some library's operations; ``constant`` makes its constants."""
+        """Evaluate the results by a library's operations; ``constant`` makes its constants."""
         values: list[Any] = []
         for row in self.rows:
             if row.name == "input":
@@ -246,25 +246,25 @@ class Formula(NamedTuple):
         return [values[i] for i in self.results]
 
     def __call__(self, *v: Tensor) -> list[Tensor]:
-        """w of tensors of one shape."""
+        """Evaluate w of tensors of one shape."""
         like = v[0] if v else torch.zeros(())
         found = self.evaluated(v, OPERATIONS, like.new_tensor)
         return [torch.as_tensor(w).expand_as(like) for w in found]
 
     def of_symbols(self, v: Sequence[Symbol]) -> list[Symbol]:
-        """w of symbols: the rows become rows of their table."""
+        """Evaluate w of symbols: the rows are added to their table."""
         table = v[0].table
         apply = {name: partial(_applied, table, name) for name in OPERATIONS}
         return [_symbol(table, w) for w in self.evaluated(v, apply, partial(_symbol, table))]
 
     def described(self) -> dict[str, Any]:
-        """The table for JSON."""
+        """Describe the table for JSON."""
         rows = [[row.name, [*row.operands], row.number] for row in self.rows]
         return {"inputs": self.inputs, "rows": rows, "results": [*self.results]}
 
     @classmethod
     def of(cls, description: Any) -> Formula:
-        """The table of a description; anything else is a ValueError."""
+        """Table of a description; anything else is a ValueError."""
         rows = [Operation(str(n), tuple(map(int, o)), float(v)) for n, o, v in description["rows"]]
         inputs, results = int(description["inputs"]), tuple(map(int, description["results"]))
         for place, row in enumerate(rows):

@@ -1,4 +1,4 @@
-"""A polynomial as static map: all monomials up to a total degree."""
+"""Polynomial as a static map: all monomials up to a total degree."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from lfrtorch.maps.written import Written
 
 
 class Polynomial(StaticMap):
-    """All monomials up to a total degree: w = C m(z), m(z) = (1, z1, z2, .., z1², z1 z2, ..).
+    """Polynomial of a total degree: w = C m(z), m(z) = (1, z1, z2, .., z1², z1 z2, ..).
 
     Affine maps of z and of w change nothing but C.
 
@@ -33,7 +33,7 @@ class Polynomial(StaticMap):
         nz: inputs.
         nw: outputs.
         degree: highest total degree.
-        device, dtype: of the weights, as in any torch module.
+        device, dtype: as in any torch module, for the weights.
 
     Shape:
         C: (nw, monomials). There are (nz + degree)! / (nz! degree!) monomials by rising degree; the
@@ -60,14 +60,14 @@ class Polynomial(StaticMap):
         for name, size in (("nz", nz), ("nw", nw), ("degree", degree)):
             integer(name, size, 1)
         check_memory(
-            nw * math.comb(nz + degree, degree) * 1000,  # bytes of Python's lists, about
+            nw * math.comb(nz + degree, degree) * 1000,  # approximate bytes of Python's lists
             f"a polynomial with nz={nz}, nw={nw} and degree={degree}",
             "give smaller ones",
         )
         super().__init__(nz, nw)
         self.degree = degree
         monomials = [
-            factors  # numbers of the z in the product
+            factors  # indices of the z in the product
             for total in range(degree + 1)
             for factors in combinations_with_replacement(range(nz), total)
         ]
@@ -78,7 +78,7 @@ class Polynomial(StaticMap):
         self.reset_parameters()
 
     def reset_parameters(self, generator: torch.Generator | None = None) -> None:
-        """C ~ U(-1, 1) / monomials, so that |w| <= 1 if all |z| <= 1, and the constant is 0."""
+        """Draw C ~ U(-1, 1) / monomials, so that |w| <= 1 if all |z| <= 1; the constant is 0."""
         with torch.no_grad():
             self.C.uniform_(-1.0, 1.0, generator=generator).div_(self.C.shape[-1])
             self.C[:, 0] = 0.0
@@ -88,12 +88,12 @@ class Polynomial(StaticMap):
         return {"C": (nw, math.comb(nz + self.degree, self.degree))}
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
-        """w of z."""
+        """Output w of z."""
         return self.monomials(z) @ self.C.mT
 
     @property
     def sizes(self) -> dict[str, int]:
-        """The degree."""
+        """Degree of the polynomial."""
         return {"degree": self.degree}
 
     def describe(self) -> dict[str, Any]:
@@ -101,25 +101,25 @@ class Polynomial(StaticMap):
         return {"type": "Polynomial", **self.sizes}
 
     def zero_output(self) -> None:
-        """C = 0."""
+        """Set C = 0."""
         with torch.no_grad():
             self.C.zero_()
 
     def redundant(self, fed: int, ny: int | None = None) -> int:
-        """Coordinates of z and w, monomials of z that nothing enters, and an affine w."""
+        """Number of coordinates of z and w, monomials of unused z, and an affine w."""
         nz = min(self.nz, fed)
         gone = self.C.shape[-1] - math.comb(nz + self.degree, nz)
         affine = 0 if ny is None else self.nw * nz + max(0, self.nw - ny)
         return self.nz * nz + self.nw * gone + self.nw**2 + affine
 
     def equations(self, z: Sequence[Any], phi: Sequence[Any]) -> Sequence[Any]:
-        """w of z and φ, single numbers each."""
+        """Output w of z and φ, single numbers each."""
         m = self._products(z)
         rows = [phi[q * len(m) : (q + 1) * len(m)] for q in range(self.nw)]
         return [combined(row[1:], m[1:], row[0]) for row in rows]
 
     def _products(self, z: Sequence[Any]) -> list[Any]:
-        """m(z) of single numbers."""
+        """Monomials m(z) of single numbers."""
         m: list[Any] = [1.0]
         for before, j in self.growth:
             m.append(m[before] * z[j] if before else z[j])
@@ -127,19 +127,19 @@ class Polynomial(StaticMap):
 
     @property
     def meaning(self) -> str:
-        """f(z) as an equation."""
+        """Equation of f(z)."""
         return "C m, m = 1, z1, z2, .., z1 z1, z1 z2, .."
 
     @property
     def written(self) -> Written:
-        """C times the monomials, each an earlier one times one z."""
+        """Write C times the monomials, each an earlier one times one z."""
         monomials = Formula.traced(lambda *z: self._products(z), self.nz)
         arrays = {"C": self.C, "growth": torch.tensor(self.growth)}
         return Written("polynomial", arrays, lambda a, z: a.affine("C", a.table(monomials, z)))
 
     @property
     def quadrature(self) -> Quadrature:
-        """Exact: a slope is a polynomial in t."""
+        """Exact rule: a slope is a polynomial in t."""
         return Quadrature.gauss_legendre((self.degree + 1) // 2, exact=True)
 
     @property
@@ -151,7 +151,7 @@ class Polynomial(StaticMap):
         return Code(0, address(_value), address(_slope, SLOPE), ints, np.zeros(0), room)
 
     def monomials(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes monomials"]:
-        """m(z)."""
+        """Monomials m(z)."""
         each = z.unbind(-1)
         m = [torch.ones_like(each[0])]
         for before, j in self.growth:

@@ -1,7 +1,8 @@
-"""The static map of a model, w = f(z; φ): what the rest of the package asks of one.
+"""Static map of a model, w = f(z; φ), as the rest of the package uses it.
 
 A new map is a class with ``equations``: value, slopes, machine code and exports follow from them.
-``Network`` and the others have faster ways of their own. No map is ``StaticMap()``, with nz = 0.
+``Network`` and others override these with faster code. ``StaticMap()`` is the absence of a map,
+with nz = 0.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from lfrtorch.maps.written import Written
 
 
 class Symmetry(NamedTuple):
-    """A change of coordinates of some of z or w that the weights of a map absorb.
+    """Change of coordinates of some of z or w that the weights of a map absorb.
 
     Args:
-        signal: of which coordinates change, z -> (I + εT) z or w -> (I + εT)⁻¹ w.
-        place: where they stand in z or w.
+        signal: ``z``, changed as z -> (I + εT) z, or ``w``, changed as w -> (I + εT)⁻¹ w.
+        place: positions of the changed entries in z or w.
         changes: T (n, size, size) and the weights by name -> their changes per ε, (n, *shape).
     """
 
@@ -42,9 +43,9 @@ class Symmetry(NamedTuple):
 
 
 class StaticMap(Module):
-    """A static map with ``nz`` inputs and ``nw`` outputs; φ are its parameters in their order.
+    """Static map with ``nz`` inputs and ``nw`` outputs; φ are its parameters in their order.
 
-    A class of one's own gives ``equations``, and its parameters in ``__init__``.
+    A subclass defines ``equations``, and its parameters in ``__init__``.
 
     Args:
         nz, nw: sizes.
@@ -66,11 +67,11 @@ class StaticMap(Module):
         self.nz, self.nw = nz, nw
 
     def equations(self, z: Sequence[Any], phi: Sequence[Any]) -> Sequence[Any]:
-        """w of z and φ, single numbers each, by operators and torch's elementary functions."""
+        """Output w of z and φ, single numbers each, by operators and torch's functions."""
         raise NotImplementedError(f"{type(self).__name__} has no equations.")
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
-        """w of z."""
+        """Output w of z."""
         if not self.nw:
             return z[..., :0]
         phi = [p.expand(z.shape[:-1]) for p in self.flat_weights().unbind()]
@@ -84,41 +85,41 @@ class StaticMap(Module):
 
     @property
     def maps(self) -> list[StaticMap]:
-        """The maps that stand beside each other in it, in the order of z and w."""
+        """Maps of a direct sum, in the order of z and w; a single map is alone."""
         return [self]
 
     @property
     def known(self) -> Any:
-        """The ``KnownModel`` that has the first z and w; None if there is none."""
+        """Known equations, a ``KnownModel`` with the first z and w; None if there are none."""
         return None
 
     @property
     def learned(self) -> StaticMap:
-        """All that stands beside the known model."""
+        """Map beside the known model."""
         return self
 
     @property
     def title(self) -> str:
-        """What messages call it."""
+        """Name of the map in messages."""
         return type(self).__name__
 
     def describe(self) -> dict[str, Any] | None:
-        """What a checkpoint says of it besides the weights, see ``maps.descriptions``."""
+        """Describe the map for a checkpoint, without weights; see ``maps.descriptions``."""
         return _own(self) if self.nw else None
 
     def beside(self, others: Sequence[StaticMap]) -> StaticMap | None:
-        """A map that is this one and others beside it, if it is simpler than a ``DirectSum``."""
+        """Join this map and others to one simpler than a ``DirectSum``; None if there is none."""
         return None
 
     def zero_output(self) -> None:
-        """Let w be 0 by weights from which a fit finds others. A map may stay as it is."""
+        """Set w to 0 by weights from which a fit can leave. A map may ignore this."""
 
     def redundant(self, fed: int, ny: int | None = None) -> int:
         """Number of directions of all weights that change no output, beside those of x.
 
         Args:
-            fed: signals that enter z, inputs and states.
-            ny: outputs, where the model holds an affine map beside this one; else None.
+            fed: number of signals that enter z, inputs and states.
+            ny: number of outputs, if the model has an affine map beside this one; else None.
         """
         return sum((each.place.stop - each.place.start) ** 2 for each in self.symmetries)
 
@@ -145,7 +146,7 @@ class StaticMap(Module):
 
     @property
     def outputs_have_parameters(self) -> bool:
-        """Whether the map holds an output equation with parameters of its own."""
+        """True if the map has an output equation with parameters of its own."""
         return False
 
     @property
@@ -155,16 +156,16 @@ class StaticMap(Module):
         return weights.new_tensor([-torch.inf, torch.inf]).repeat(len(weights), 1)
 
     def flat_weights(self) -> Float[Tensor, " P"]:
-        """φ."""
+        """Weights φ in one vector."""
         own = [p.flatten() for p in self.parameters()]
         return torch.cat(own) if own else torch.zeros(0)
 
     def of_weights(self, z: Float[Tensor, "*axes nz"], phi: Float[Tensor, " P"]) -> Tensor:
-        """w of z with the weights φ in place of the map's own."""
+        """Output w of z with the weights φ in place of the map's own."""
         return functional_call(self, self.named_weights(phi), (z,))
 
     def named_weights(self, phi: Float[Tensor, " P"]) -> dict[str, Tensor]:
-        """φ by the names of the parameters."""
+        """Weights φ by the names of the parameters."""
         named = [(name, p.shape, p.numel()) for name, p in self.named_parameters()]
         parts = phi.split([count for _, _, count in named])
         return {n: p.view(shape) for (n, shape, _), p in zip(named, parts, strict=True)}
@@ -172,7 +173,7 @@ class StaticMap(Module):
     def slope(
         self, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"]
     ) -> Float[Tensor, "R T nw nz"]:
-        """∂w/∂z at every sample, in torch."""
+        """Slope ∂w/∂z at every sample, in torch."""
         if not self.nw:
             return z.new_zeros(*z.shape[:-1], 0, 0)
         of_z = jacrev(lambda z: self.of_weights(z, phi))
@@ -181,7 +182,7 @@ class StaticMap(Module):
     def by_weight(
         self, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"]
     ) -> Float[Tensor, "R T nw P"]:
-        """∂w/∂φ at every sample, in torch."""
+        """Derivatives ∂w/∂φ at every sample, in torch."""
         if not len(phi):
             return z.new_zeros(*z.shape[:-1], self.nw, 0)
         of_phi = jacrev(lambda phi, z: self.of_weights(z, phi))
@@ -190,9 +191,9 @@ class StaticMap(Module):
     def enclosure(
         self, z: Interval, a: Interval | None = None, K: Float[Array, "nw nz"] | None = None
     ) -> Enclosure | None:
-        """Bounds of w and its slopes in a box z (nz,); None if none are known.
+        """Bounds of w and its slopes over a box z (nz,); None if none are known.
 
-        ``a`` is what ``right`` z of its neurons cannot leave besides. With ``K``, w - K z is
+        Interval ``a`` bounds ``right`` z of the neurons in addition. If ``K`` is given, w - K z is
         bounded instead of w.
         """
         return None
@@ -200,27 +201,27 @@ class StaticMap(Module):
     def slopes_in(
         self, v: Interval, into: Float[Array, "nz nz"], middle: Float[Array, " nz"]
     ) -> Interval | None:
-        """What ∂w/∂v (C, nw, nz) cannot leave in cells of v (C, nz), z = into v + middle."""
+        """Bounds of ∂w/∂v (C, nw, nz) over cells of v (C, nz), z = into v + middle."""
         return None
 
     @property
     def quadrature(self) -> Quadrature:
-        """How means of ∂w/∂z between two z are computed."""
+        """Quadrature rule for means of ∂w/∂z between two z."""
         return Quadrature.gauss_legendre(32)
 
     @property
     def neurons(self) -> Neurons | None:
-        """Functions of one number each that the map is made of, with exact mean slopes."""
+        """Scalar functions of which the map is composed, with exact mean slopes."""
         return None
 
     @property
     def meaning(self) -> str:
-        """f(z) as an equation, for the readers of an export."""
+        """Equation of f(z), for the readers of an export."""
         return f"{type(self).__name__}(z)"
 
     @property
     def written(self) -> Written | None:
-        """What exports write; None if torch alone can compute the map."""
+        """Form of the map for exports; None if torch alone can compute it."""
         formula = self.formula
         if formula is None:
             return None
@@ -228,7 +229,7 @@ class StaticMap(Module):
 
     @property
     def formula(self) -> Formula | None:
-        """z -> w with the weights as numbers; None if no equations are known."""
+        """Formula z -> w with the weights as numbers; None if no equations are known."""
         if not self.nw:
             return Formula(0, (), ())
         phi = self.flat_weights().detach().double().cpu().tolist()
@@ -238,19 +239,19 @@ class StaticMap(Module):
 
         try:
             return Formula.traced(of, self.nz)
-        except NotImplementedError:  # of the map, or of a part of it
+        except NotImplementedError:  # error of the map, or of a part of it
             return None
 
 
 class OwnModule(StaticMap):
-    """A module of the user's own, which torch computes."""
+    """Map of a user's module, which torch computes."""
 
     def __init__(self, module: Module, nz: int, nw: int) -> None:
         super().__init__(nz, nw)
         self.module = module
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
-        """w of z."""
+        """Output w of z."""
         return self.module(z)
 
     @property
@@ -267,17 +268,17 @@ class OwnModule(StaticMap):
 
     @property
     def code(self) -> Code | None:
-        """None."""
+        """Machine code: none."""
         return None
 
     @property
     def meaning(self) -> str:
-        """The user's class."""
+        """Name the user's class."""
         return f"{type(self.module).__name__}(z)"
 
 
 def as_map(static: Module | None, nz: int, nw: int) -> StaticMap:
-    """The static map that a module is: itself, or a module of the user's own."""
+    """Return a module as a static map: itself, or an ``OwnModule``."""
     if static is None:
         return StaticMap()
     if isinstance(static, StaticMap) and not _is_changed(type(static)):
@@ -290,7 +291,7 @@ def _own(module: Module) -> dict[str, Any]:
 
 
 def _is_changed(kind: type) -> bool:
-    """Tell whether a class has another forward pass than that its equations or code belong to."""
+    """Tell if a class overrides the forward pass to which its equations or code belong."""
     order = [each.__dict__ for each in kind.__mro__]
 
     def defined(name: str) -> int:

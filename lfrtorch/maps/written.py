@@ -1,4 +1,4 @@
-"""A static map as exports write it: arrays and loops, or a table of operations."""
+"""Static map for exports: arrays and loops, or a table of operations."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from lfrtorch.maps.operations import Formula
 
 
 class Vectors(Protocol):
-    """What a language of vectors computes; it knows the arrays of the map by their names."""
+    """Operations of a language of vectors, which knows the arrays of the map by their names."""
 
     def affine(self, W: str, v: Any, b: str = "") -> Any:
-        """W v + b."""
+        """Affine map W v + b."""
         ...
 
     def each(self, sigma: Formula, v: Any) -> Any:
-        """A function of one number, of every entry of v."""
+        """Apply a scalar function to every entry of v."""
         ...
 
     def table(self, formula: Formula, v: Any) -> Any:
-        """A function of the entries of v."""
+        """Apply a table of operations to the entries of v."""
         ...
 
 
 class Written(NamedTuple):
-    """What every export of a map is made of.
+    """Parts of a map from which every export is made.
 
     Args:
-        template: which of the texts in ``export/templates/maps`` say the map in C, in Python and in
-            MATLAB. They have the attributes of the map.
-        arrays: the numbers of those texts by name, for a map of arrays and loops.
-        of: a language and z -> w, where there are expressions instead of texts.
-        formula: of a map that has nothing but its table of operations.
+        template: name of the templates of the map in ``export/templates/maps``, for C, Python and
+            MATLAB. They use the attributes of the map.
+        arrays: arrays of those templates by name, for a map of arrays and loops.
+        of: evaluates a language at z -> w, where exports use expressions instead of templates.
+        formula: table of operations of a map that has nothing else.
     """
 
     template: str

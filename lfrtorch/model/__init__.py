@@ -1,4 +1,4 @@
-"""An LFR with its scaling, rate and channels, and its states online."""
+"""An LFR with its scaling, rate and channels, and online observers of its states."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ _NAMES = ("Model", "Resampled", "load", "simulate_blocks")
 
 
 def __getattr__(name: str) -> object:
-    """Import the model when it is asked for: its observers need none of it."""
+    """Import the model at its first use: its observers do not need it."""
     if name in _NAMES:
         return getattr(_import_module("lfrtorch.model.model"), name)
     raise AttributeError(f"module 'lfrtorch.model' has no attribute '{name}'")

@@ -1,4 +1,4 @@
-"""How far the data of a fit went: where a model is known, and where it extrapolates."""
+"""Range of the data of a fit, outside of which a model extrapolates."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from lfrtorch._support.types import Array
 from lfrtorch.data.records import Channel
 
 FARTHEST = 0.99
-"""Part of the samples whose surprise is below 1."""
+"""Part of the samples with a surprise index below 1."""
 
 _FLAT = 1e-12  # relative power below which a direction has no signal
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Where the samples of a signal z lie: 99 % within ``farthest`` of ``axes (z - middle)``.
+    """Samples of a signal z: |axes (z - middle)| is at most ``farthest`` for 99 % of them.
 
     Args:
         middle: mean.
         axes: axes (z - middle) has unit covariance.
-        ends: the least and the largest entries of that vector: a box of all samples.
-        farthest: its length that 99 % of the samples do not exceed.
+        ends: least and largest entries of that vector: a box of all samples.
+        farthest: length of that vector that 99 % of the samples do not exceed.
 
     Shape:
         middle: (n,), axes: (n, n), ends: (n, 2).
@@ -48,22 +48,22 @@ class Cloud:
         )
 
     def surprise(self, z: Float[Array, "*T n"]) -> Float[Array, "*T"]:
-        """How far z is from the middle: 1 is as far as 99 % of the samples go."""
+        """Surprise index of z: its distance from the middle; 1 contains 99 % of the samples."""
         distance = np.linalg.norm((z - self.middle) @ self.axes.T, axis=-1)
         return np.asarray(distance / self.farthest)
 
     def turned(self, Z: Float[Array, "n n"]) -> Cloud:
-        """Return that of Z z."""
+        """Return the cloud of Z z."""
         return Cloud(Z @ self.middle, self.axes @ np.linalg.inv(Z), self.ends, self.farthest)
 
 
 @dataclass(frozen=True, eq=False)
 class DataReach:
-    """How far the data of a fit went.
+    """Range of the data of a fit.
 
     Args:
-        u, y: the least and the largest of each channel, physical units.
-        z: input of the static map, normalised.
+        u, y: least and largest value of each channel, physical units.
+        z: cloud of the input of the static map, normalised.
 
     Shape:
         u: (nu, 2), y: (ny, 2).
@@ -99,7 +99,7 @@ class DataReach:
         inputs: Sequence[Channel],
         outputs: Sequence[Channel],
     ) -> str:
-        """What of an operating point the data did not reach, in words; empty if nothing."""
+        """Parts of an operating point that the data did not reach, in words; empty if none."""
         found = []
         for values, ranges, channels in ((u, self.u, inputs), (y, self.y, outputs)):
             for value, (low, high), channel in zip(values, ranges, channels, strict=True):
@@ -114,7 +114,7 @@ class DataReach:
 
 
 def whitening(signal: Float[Array, "S n"]) -> Float[Array, "n n"]:
-    """T such that T s has unit covariance."""
+    """Matrix T such that T s has unit covariance."""
     centred = signal - signal.mean(axis=0)
     power, axes = np.linalg.eigh(centred.T @ centred / len(centred))
     least = max(_FLAT * float(power.max(initial=0.0)), 1e-300)

@@ -1,4 +1,4 @@
-"""The extended Kalman filter of a model, and the covariances of noise that it needs."""
+"""Extended Kalman filter of a model, and the noise covariances that it needs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from lfrtorch.engine.kalman_kernel import (
 from lfrtorch.engine.linearised import linearise
 from lfrtorch.model.state_observer import StateObserver
 
-_ROUNDING = 1e-9  # part of the largest eigenvalue by which a negative one may be rounding
+_ROUNDING = 1e-9  # part of the largest eigenvalue below which a negative one is a rounding error
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +36,13 @@ class NoiseCovariance:
         x+ = f(x, u) + w        Q = E w wᵀ,  R = E v vᵀ,  S = E w vᵀ
         y  = h(x, u) + v
 
-    A number is the variance of each, a vector has the variances. ``lfrtorch.estimate_noise`` finds
-    them from records.
+    A number is the variance of every channel, a vector has a variance for each.
+    ``lfrtorch.estimate_noise`` estimates the covariances from records.
 
     Args:
-        Q: of the states, in the model's coordinates. 0: nothing disturbs them.
-        R: of the outputs, in their units squared; positive definite.
-        S: of states and outputs. Default: 0, none of the noise is in both.
+        Q: covariance on the states, in the model's coordinates; 0 for undisturbed states.
+        R: covariance on the outputs, in their units squared; positive definite.
+        S: cross covariance of states and outputs. Default: 0.
 
     Shape:
         Q: (nx, nx), (nx,) or a number, R: (ny, ny), (ny,) or a number, S: (nx, ny).
@@ -64,7 +64,7 @@ class NoiseCovariance:
         """G with G Gᵀ = [R Sᵀ; S Q] in the same units, lower triangular in blocks.
 
         Raises:
-            ValueError: covariances that are none, or of other sizes.
+            ValueError: invalid covariances, or other sizes.
         """
         Q, R = _covariance("Q", self.Q, nx), _covariance("R", self.R, ny)
         S = np.zeros((nx, ny)) if self.S is None else reals("S", self.S)
@@ -89,25 +89,24 @@ class NoiseCovariance:
 
 @final
 class ExtendedKalmanFilter(StateObserver):
-    """The extended Kalman filter: the gain follows from the noise and the model's Jacobians.
+    """Extended Kalman filter: the gain follows from the noise and the model's Jacobians.
 
-    ``update`` corrects the states by the output, with ∂y/∂x at their prediction, and takes them
-    to the next sample, with ∂x+/∂x where they now are. All covariances are kept as square roots,
-    and no covariance is a difference of two. A missing output corrects nothing, and the covariance
-    grows.
+    ``update`` corrects the states by the output, with ∂y/∂x at the predicted states, and propagates
+    them to the next sample, with ∂x+/∂x at the corrected states. Covariances are kept as square
+    roots, and none is a difference of two. A missing output corrects nothing: the covariance grows.
 
     Args:
-        cell, scaler, inputs, outputs: of the model.
-        x0: where the states begin, in the model's coordinates.
-        noise: on states and outputs.
-        P0: covariance of x0, its variances, or one number for all states. Default: that of the
-            states over the training data.
+        cell, scaler, inputs, outputs: parts of the model.
+        x0: initial states, in the model's coordinates.
+        noise: covariances of the noise on states and outputs.
+        P0: covariance of the error of x0, its variances, or one number for all states. Default:
+            covariance of the states over the training data.
 
     Shape:
         x0: (nx,), P0: (nx, nx), (nx,) or a number.
 
     Raises:
-        ValueError: a state or a covariance of another size, or one that is none.
+        ValueError: a state or a covariance of another size, or an invalid covariance.
 
     References:
         Anderson and Moore, "Optimal Filtering", 1979, section 8.2.
@@ -146,7 +145,7 @@ class ExtendedKalmanFilter(StateObserver):
         """Covariance of the error of ``state``, then ``disturbance``; it may be set.
 
         Raises:
-            ValueError: a covariance of another size, or one that is none.
+            ValueError: a covariance of another size, or an invalid one.
         """
         U = self._U
         if self._corrected:
@@ -160,7 +159,7 @@ class ExtendedKalmanFilter(StateObserver):
         self._predicted = self._corrected = False
 
     def follow(self, u: Float[Array, "T nu"], y: Float[Array, "T ny"]) -> float:
-        """Go on over many samples at once, as ``predict`` and ``update`` would one by one.
+        """Filter many samples at once, as ``predict`` and ``update`` would one by one.
 
         Args:
             u, y: inputs and outputs, physical units, NaN for missing outputs.
@@ -204,7 +203,7 @@ class ExtendedKalmanFilter(StateObserver):
 
     @torch.no_grad()
     def _slopes(self) -> tuple[Array, Array, Array, Array]:
-        """y, x+, F = ∂x+/∂x and H = ∂y/∂x of a map that is not compiled."""
+        """Output y, next states x+, F = ∂x+/∂x and H = ∂y/∂x of a map that is not compiled."""
         u, state = torch.as_tensor(self._u_now), torch.as_tensor(self._x_now)
         y, x_next = self._cell(u, state)
         F, H = linearise(self._cell, self._cell.internal(u, state)[0][None, None])
@@ -227,7 +226,7 @@ def _covariance_root(name: str, given: ArrayLike, size: int) -> Float[Array, "n 
 
 
 def inside_limits(record: Record) -> Float[Array, "T ny"]:
-    """Return the outputs of a record, NaN where they may be beyond its limits or are not valid."""
+    """Return the outputs of a record, NaN where they are at its limits or not valid."""
     y = np.where(record.beyond, np.nan, record.y)
     return y if record.valid is None else np.where(record.valid, y, np.nan)
 
@@ -250,7 +249,7 @@ def _covariance(name: str, given: ArrayLike, size: int) -> Float[Array, "n n"]:
 def with_variances(
     name: str, given: ArrayLike, more: Float[Array, " m"], size: int
 ) -> Float[Array, "n n"]:
-    """Return a covariance of some states and of more that are independent of them."""
+    """Return a covariance of some states and of further ones independent of them."""
     return scipy.linalg.block_diag(_covariance(name, given, size), np.diag(more))
 
 

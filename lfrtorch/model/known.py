@@ -1,4 +1,4 @@
-"""A model that is known: equations in physical units, with parameters that a fit may find."""
+"""Known model: equations in physical units, with parameters that a fit may estimate."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from lfrtorch.maps.operations import Formula, UntraceableError
 @typed()
 @dataclass(frozen=True)
 class Parameter:
-    """A physical parameter that a fit finds.
+    """Physical parameter, estimated by a fit.
 
     Args:
-        value: where the fit starts.
-        low, high: bounds that it keeps.
-        unit: as in "kg".
-        scale: by how much it may change in a fit, about. Default: |value|, or the distance of the
+        value: initial value of the fit.
+        low, high: bounds that the fit keeps.
+        unit: unit, as "kg".
+        scale: approximate change of the value in a fit. Default: |value|, or the distance of the
             bounds, or 1.
 
     Raises:
@@ -65,13 +65,13 @@ class Parameter:
 @typed()
 @dataclass(frozen=True)
 class State:
-    """A state in its unit.
+    """State with its unit.
 
     Args:
-        name: as the equations call it.
-        unit: as in "rad/s".
-        rest: where it is at rest, and where a record with ``start="zero"`` begins.
-        scale: its rms about that, roughly. Default: that of a simulation of the training records.
+        name: name in the equations.
+        unit: unit, as "rad/s".
+        rest: value at rest, and at the beginning of a record with ``start="zero"``.
+        scale: approximate rms about that. Default: rms in a simulation of the training records.
 
     Example:
         >>> lfrtorch.State("speed", unit="m/s")
@@ -91,32 +91,33 @@ class State:
 
 @typed()
 class Known:
-    """A model of the physics: dx/dt = f(x, u, p), y = h(x, u, p), or x(k+1) = f(x, u, p).
+    """Model of the physics: dx/dt = f(x, u, p), y = h(x, u, p), or x(k+1) = f(x, u, p).
 
-    All signals and parameters are in physical units. ``f`` and ``outputs`` are functions of torch's
+    All signals and parameters are in physical units. ``f`` and ``outputs`` are composed of torch's
     functions: x and p have the states and parameters by name, u the inputs in their order. They are
-    called once, and what they compute is written down: a model needs them no more.
+    called once, and their operations are recorded: a model does not need them afterwards.
 
     Args:
         f: the rates, or the next states with ``method="discrete"``: a tuple, one for each state.
         states: names, or a :class:`State` each.
-        parameters: what a fit finds, by name: a :class:`Parameter`, or a number to start from.
-        outputs: y, a tuple. Default: the states that outputs of the data are called after; of as
-            many states as outputs, the others are in their order.
-        method: how a sample is made of f: ``"rk4"``, the classical method of Runge and Kutta,
+        parameters: parameters to estimate, by name: a :class:`Parameter`, or an initial value.
+        outputs: y, a tuple. Default: the states with the names of the data's outputs; if there are
+            as many states as outputs, the remaining ones follow in their order.
+        method: integration over a sample: ``"rk4"``, the classical method of Runge and Kutta,
             ``"euler"``, or ``"discrete"``.
-        substeps: steps of the method in a sample (in half a one with ``"bl"``).
+        substeps: steps of the method in a sample (in half a sample with ``"bl"``).
         intersample: the inputs between samples: ``"zoh"``, held until the next, as a converter
-            does; ``"bl"``, samples of a band-limited signal. That is held from half a sample before
-            to half a sample after each, so states are those half a sample before.
-        sees: what a learned part beside the model is a function of: states by name, and ``"u"`` for
-            the inputs. Default: all.
-        acts_on: states by name, and ``"y"`` for the outputs, that it acts on. Default: all. A speed
-            is the rate of a position for certain: what is unknown acts on the speed alone.
+            does, or ``"bl"``, samples of a band-limited signal. The latter are held from half a
+            sample before to half a sample after each, so that x is the state half a sample before.
+        sees: inputs of a learned part beside the model: states by name, and ``"u"`` for the
+            inputs. Default: all.
+        acts_on: states by name, and ``"y"`` for the outputs, that the learned part acts on.
+            Default: all. The rate of a position is certainly the speed, so that an unknown effect
+            acts on the speed alone.
 
     Raises:
-        ValueError: names that are no Python names, stand twice or belong to nothing, or, once it
-            meets data, functions that are not of single numbers and torch's elementary functions.
+        ValueError: names that are no Python names, stand twice or belong to nothing; with the
+            data, functions that are not composed of scalars and torch's elementary functions.
 
     Example:
         >>> def pendulum(x, u, p):
@@ -185,10 +186,11 @@ class Known:
         return f"Known({name}: {', '.join(self._x._fields)}; {', '.join(self.parameters)})"
 
     def observed(self, outputs: Sequence[str]) -> tuple[str, ...]:
-        """The state that each output of the data is, by name, if ``outputs`` is not given.
+        """States that are the outputs of the data, by name, if ``outputs`` is not given.
 
         Raises:
-            ValueError: outputs that are not called after states, and not as many as are left.
+            ValueError: outputs without the name of a state, whose number differs from that of the
+                remaining states.
         """
         names = self._x._fields
         others = [name for name in outputs if name not in names]
@@ -204,7 +206,7 @@ class Known:
         return tuple(found.get(name, name) for name in outputs)
 
     def equations(self, nu: int, outputs: Sequence[str]) -> KnownEquations:
-        """The equations as tables of operations, for so many inputs and outputs of these names.
+        """Tables of operations of the equations, for ``inputs`` inputs and outputs of these names.
 
         Raises:
             ValueError: functions that have no table, or return other numbers of values.
@@ -241,7 +243,7 @@ class Known:
         return KnownEquations(f, h, *names, units, nu, *how)
 
     def map(self, nu: int, outputs: Sequence[str], fs: float) -> KnownModel:
-        """The equations as a static map of an LFR, of signals in physical units, in float64."""
+        """Equations as a static map of an LFR, for signals in physical units, in float64."""
         found = KnownModel(self.equations(nu, outputs), 1.0 / fs, dtype=torch.float64)
         with torch.no_grad():
             for i, parameter in enumerate(self.parameters.values()):

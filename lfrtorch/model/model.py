@@ -1,4 +1,4 @@
-"""The identified model: an LFR with its scaling, ready to simulate in physical units."""
+"""Identified model: an LFR with its scaling, ready to simulate in physical units."""
 
 from __future__ import annotations
 
@@ -70,14 +70,19 @@ NO_OBSERVER = (
 )
 
 Disturbance = Literal["input", "output"] | ArrayLike
-"""Where a constant disturbance acts: on all inputs, on all outputs, or a matrix."""
+"""Place of constant disturbances: all inputs, all outputs, or a matrix of their effects."""
 
-_STEPS, _HELD, _COMMON = 100, 20, 100
-"""Of the input that compares a resampled model: steps, common samples of each, and the longest
-common sample, in samples."""
+_STEPS = 100
+"""Random steps of the input on which a resampled model is compared."""
+
+_HELD = 20
+"""Common samples of each of these steps."""
+
+_COMMON = 100
+"""Longest common sample of two rates, in samples."""
 
 _TOGETHER = 1000
-"""Predictions that are simulated at once."""
+"""Number of predictions that are simulated at once."""
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -112,18 +117,18 @@ class Resampled(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """An LFR and what it takes to use it: scaling with offsets, rate, channel names and units.
+    """An LFR with scaling, sampling rate, channel names and units.
 
     Args:
         lfr: the model in normalised units.
         scaler: physical to normalised units, at both ends.
         fs: sampling frequency in Hz.
         inputs, outputs: channel names and units.
-        fitted_to: the data in words, for ``print(model)``.
+        fitted_to: description of the data, for ``print(model)``.
         K: gain of the innovations e in x+ = A x + Bu u + Bw w + K e, y = ... + e, with x and y
             normalised. Default: no noise model; ``lfrtorch.fit`` finds one with
             ``noise="innovation"``.
-        reach: how far the data went; ``reaching`` finds it.
+        reach: range of the data; ``reaching`` finds it.
 
     Shape:
         K: (nx, ny).
@@ -212,7 +217,7 @@ class Model:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """nx, nz, nw, and nn or the degree of a polynomial; nn = 0 for a map of the user's own."""
+        """Sizes nx, nz, nw, and nn or the degree of a polynomial; nn = 0 for a user's map."""
         cell, learned = self.lfr.cell, self.lfr.cell.map.learned
         nx = cell.nx - self.known_states
         return {"nx": nx, "nz": learned.nz, "nw": learned.nw, **learned.sizes}
@@ -225,10 +230,10 @@ class Model:
 
     @property
     def state_covariance(self) -> Float[Array, "nx nx"]:
-        """E x xᵀ of the states over the training data, about 0; before a fit 1.
+        """Second moment E x xᵀ of the states over the training data, about 0; before a fit 1.
 
-        So wrong is x = 0 amid data like these. The states are those of the simulation, and of a
-        model with K those of the prediction. A fit leaves a diagonal of 1.
+        This is the covariance of the error of x = 0 amid such data. The states are those of the
+        simulation, or of the prediction for a model with K. Its diagonal is 1 after a fit.
 
         Example:
             >>> model.state_covariance
@@ -239,8 +244,8 @@ class Model:
     def reaching(self, records: Record | Sequence[Record]) -> Model:
         """The model with the reach of these data: the ranges of u and y, and z of the simulation.
 
-        What ``lfrtorch.identify`` returns has that of its data for estimation. Exports and
-        ``lfrtorch.analysis.linearise`` then tell where the model extrapolates.
+        Models from ``lfrtorch.identify`` have the reach of their estimation data. Exports and
+        ``lfrtorch.analysis.linearise`` use it to tell where the model extrapolates.
 
         Example:
             >>> model.reaching(record).reach.u.round(1).tolist() == [
@@ -257,7 +262,7 @@ class Model:
         return replace(self, reach=DataReach.of(u, y, z))
 
     def outside(self, u: Float[Array, " nu"], x: Float[Array, " nx"]) -> str:
-        """What of u (physical units) and x was outside of the data, in words; empty if nothing was.
+        """Parts of u (physical units) and x outside the data, in words; empty if none are.
 
         Example:
             >>> model.reaching(record).outside(np.zeros(1), np.zeros(1))
@@ -282,11 +287,11 @@ class Model:
     def net_parameter_count(self) -> int:
         """P less the gauge directions, which change the parameters and not the output.
 
-        nx² for the coordinates of x, nz² and nw² for those of z and w (a network and a polynomial
-        absorb them), max(0, nw - ny) for a constant w that hides in the origin of the state, and
-        nz nw for the linear terms of a polynomial, which A, Bu, Cy and Dyu hold as well. Entries
-        that a fit holds leave fewer coordinates. Where only n < nz signals enter z (the inputs, or
-        the states without feedthrough), the map is one of n.
+        The gauge directions are nx² for the coordinates of x, nz² and nw² for those of z and w (a
+        network and a polynomial absorb them), max(0, nw - ny) for a constant w that shifts the
+        origin of the state, and nz nw for the linear terms of a polynomial, which A, Bu, Cy and Dyu
+        contain as well. Held entries leave fewer. If only n < nz signals enter z (the inputs, or
+        the states without feedthrough), the map counts as one of n inputs.
         """
         cell = self.lfr.cell
         shapes = {"Cz": (cell.nz, cell.nx), "Dzu": (cell.nz, cell.nu)}
@@ -311,11 +316,11 @@ class Model:
         """Simulated output in physical units.
 
         Args:
-            data: a record, an input in physical units, or a pandas data frame with columns that are
-                called as the inputs: of it the outputs come as a frame with its index.
+            data: a record, an input in physical units, or a pandas data frame with columns named as
+                the inputs; its outputs come as a frame with the same index.
             start: ``"zero"`` (x = 0: at rest at the input's offset, up to the network's bias),
-                ``"given"`` (x0), ``"periodic"``, ``"measured"``: from the state that the record's
-                first output tells, or ``"estimated"``: from the most probable state, given the
+                ``"given"`` (x0), ``"periodic"``, ``"measured"``: from the state determined by the
+                record's first output, or ``"estimated"``: from the most probable state, given the
                 record's output in the samples it skips, or in all if it skips none.
                 Default: the record's own, and ``"zero"`` for a bare input.
             x0: initial state in the model's coordinates, for ``start="given"``.
@@ -340,7 +345,7 @@ class Model:
         return data.shown(y) if isinstance(data, Record) else y
 
     def _inputs_of(self, frame: Any) -> Array:
-        """The inputs among the columns of a frame."""
+        """Inputs among the columns of a frame."""
         check_index(frame, self.fs)
         wanted = [channel.name for channel in self.inputs]
         return columns_of(frame, places_of(frame, wanted, "model's inputs"))
@@ -348,7 +353,7 @@ class Model:
     def signals(
         self, data: Record | ArrayLike, *, start: Start | None = None, x0: ArrayLike | None = None
     ) -> Trajectory:
-        """All signals x, z, w, y of the same simulation, normalised, on the CPU, with R = 1.
+        """All signals x, z, w, y of the simulation, normalised, on the CPU, with R = 1.
 
         Example:
             >>> trajectory = model.signals(record)
@@ -384,12 +389,12 @@ class Model:
 
     @typed()
     def predict(self, record: Record, *, horizon: int = 1) -> Array:
-        """Output (T, ny) predicted so many samples ahead, in physical units.
+        """Output (T, ny) predicted ``horizon`` samples ahead, in physical units.
 
-        The prediction of a sample knows the inputs up to it, and the outputs up to ``horizon``
-        samples before it. In the first samples, before which there are none, it is a simulation.
-        A model without K predicts from the output that far before alone, if that tells its states:
-        of records with a measured start.
+        The prediction of a sample uses the inputs up to it, and the outputs up to ``horizon``
+        samples before it. The first samples, which have no such outputs, are simulated. A model
+        without K predicts from the single output ``horizon`` samples before, which must determine
+        its states: the start of its records is ``"measured"``.
 
         Args:
             record: inputs and measured outputs.
@@ -418,7 +423,7 @@ class Model:
         u = torch.as_tensor(self.scaler.normalise_u(record.u)).to(cell.A)
         x, y = states.to(cell.A), cell.A.new_empty(T, cell.ny)
         with torch.no_grad():
-            for ahead in range(min(horizon, T)):  # x: the states so far after what is known
+            for ahead in range(min(horizon, T)):  # x: predicted so far from the known outputs
                 y[ahead:], after = cell(u[ahead:], x)
                 x = after[:-1]
         return record.shown(self.scaler.restore_y(y.double().cpu().numpy()))
@@ -426,7 +431,7 @@ class Model:
     def ahead(self, record: Record, horizon: int) -> Array:
         """Outputs predicted 1 to ``horizon`` samples ahead of every sample, in physical units.
 
-        Each prediction begins in the state that the output of its sample tells, and knows the
+        Each prediction begins in the state determined by the output of its sample, and uses the
         inputs that follow.
 
         Shape:
@@ -482,26 +487,26 @@ class Model:
         x0: ArrayLike | None = None,
         P0: ArrayLike | None = None,
     ) -> StateObserver:
-        """Return what follows the states of the running system, sample by sample.
+        """Observer of the states of the running system, sample by sample.
 
-        With the covariances of the noise it is an extended Kalman filter, of any model. Otherwise
+        Given the covariances of the noise it is an extended Kalman filter, of any model. Otherwise
         it has the constant gain K of a model in innovation form.
 
         Args:
-            noise: on states and outputs. Default: the gain K.
-            disturbance: what nobody measures and stays, such as a load, is estimated too, on the
+            noise: covariances of the noise on states and outputs. Default: the gain K.
+            disturbance: also estimate unmeasured constant disturbances, such as a load, on the
                 ``"input"``, the ``"output"``, or by a matrix, see ``with_disturbance``. A
-                controller needs it to be without offset. Default: none.
-            after: what was measured until now; the states go on from its end. A filter begins at
-                its first sample from x = 0 and P0.
-            x0: where they begin otherwise, in the model's coordinates. Default: 0.
-            P0: covariance of where a filter begins, variances, or one. Default:
+                controller without offset needs it. Default: none.
+            after: measurements until now; the states continue from its end. A filter begins at its
+                first sample from x = 0 and P0.
+            x0: initial states without ``after``, in the model's coordinates. Default: 0.
+            P0: covariance of the error of a filter's initial states, variances, or one. Default:
                 ``state_covariance``, the right one amid data like those of the fit.
 
         Raises:
-            ValueError: neither K nor noise, covariances that are none, both a record and a state,
-                a record of other channels or another rate, or a disturbance without noise or that
-                the outputs do not tell.
+            ValueError: neither K nor noise, invalid covariances, both a record and a state, a
+                record of other channels or another rate, or a disturbance without noise or that is
+                not detectable from the outputs.
 
         Example:
             >>> linear = lfrtorch.estimate_bla(record, nx=1, refine="prediction")
@@ -546,25 +551,25 @@ class Model:
     def with_disturbance(
         self, at: Disturbance, noise: NoiseCovariance
     ) -> tuple[Model, NoiseCovariance]:
-        """The model with constant disturbances as states, and the noise of all its states.
+        """Model with constant disturbances as states, and the noise of all its states.
 
-        Its states are x and then d, in physical units: u + Eu d enters in the place of u, and Ey d
-        is added to y. So it may be exported with its observer, and a controller that predicts with
-        it, from estimates of both, has no offset.
+        The states are x and then d, in physical units: u + Eu d replaces u, and Ey d is added to y.
+        The model may be exported with its observer. A controller that predicts with it, from
+        estimates of both, has no offset.
 
         Args:
             at: ``"input"``, one on each input; ``"output"``, one on each output; or the matrix
                 [Eu; Ey] with a row for each input, then each output, and a column for each
                 disturbance.
-            noise: of the model. A disturbance drifts by a tenth of its channel's scale, rms, in the
-                slowest time constant, unless Q is of all states.
+            noise: covariances of the model's noise. A disturbance drifts by a tenth of the scale of
+                its channel, rms, in the slowest time constant, unless Q is of all states.
 
         Shape:
             at: (nu + ny, nd).
 
         Raises:
-            ValueError: a matrix of another size, or disturbances that the outputs at rest do not
-                tell from each other and from the states: more than outputs, for example.
+            ValueError: a matrix of another size, or disturbances that are not detectable from the
+                outputs at rest: more disturbances than outputs, for example.
 
         References:
             Pannocchia and Rawlings, "Disturbance models for offset-free model-predictive control",
@@ -605,9 +610,9 @@ class Model:
     def resample(self, fs: float) -> Resampled:
         """The model at another sampling rate, with inputs that are held over a sample.
 
-        What it is at rest, linearised, is resampled exactly, by the logarithm of its matrices. The
-        static map sees its input at the new samples, so that the model is another one away from
-        rest; ``error`` says by how much. The gain K of a noise model does not stay.
+        The model linearised at rest is resampled exactly, by the logarithm of its matrices. The
+        static map is evaluated at the new samples, so that the model differs away from rest;
+        ``error`` is the size of the difference. The gain K of a noise model is dropped.
 
         Args:
             fs: Hz.
@@ -632,7 +637,7 @@ class Model:
         K = static_slope(cell, z[None, None])[0, 0].detach().numpy()
         made = LFR(resampled_cell(cell, K, self.fs / fs))
         other = replace(self, lfr=made, fs=fs, K=None)
-        # Both simulate the same input, held over the samples of both.
+        # Both models simulate the same input, held over the samples of both.
         slow, fast = sorted([fs, self.fs])
         ratio = Fraction(fast / slow).limit_denominator(_COMMON)
         ratio = 1 / ratio if fs < self.fs else ratio
@@ -648,7 +653,7 @@ class Model:
         return Resampled(other, np.sqrt(np.mean((new - old) ** 2, axis=0)))
 
     def _entries(self, at: Disturbance) -> Float[Array, "n nd"]:
-        """[Eu; Ey] of disturbances."""
+        """Matrix [Eu; Ey] of disturbances."""
         nu, ny = len(self.inputs), len(self.outputs)
         named = {"input": np.eye(nu + ny, nu), "output": np.eye(nu + ny)[:, nu:]}
         if isinstance(at, str):
@@ -675,7 +680,7 @@ class Model:
         return self
 
     def predictor(self) -> Model:
-        """The model of the output one sample ahead; its inputs are u, then y.
+        """One-step predictor of the output as a model; its inputs are u, then y.
 
         Raises:
             ValueError: a model without K.
@@ -700,7 +705,7 @@ class Model:
         return replace(self, lfr=LFR(cell), scaler=scaler, inputs=inputs, K=None)
 
     def innovation_form(self) -> Model:
-        """The system's own model, with K, of its predictor: the inverse of ``predictor``.
+        """Model of the system, with K, from its predictor: the inverse of ``predictor``.
 
         Example:
             >>> linear = lfrtorch.estimate_bla(record, nx=1, refine="prediction")
@@ -761,15 +766,15 @@ class Model:
 def simulate_blocks(
     model: Model, blocks: Iterable[ArrayLike], *, x0: ArrayLike | None = None
 ) -> Iterator[Array]:
-    """Simulated output of an input that comes in blocks, as if it were simulated in one go.
+    """Simulated output of an input in blocks, the same as in one go.
 
     The numbers are the same to the bit if the CPU has the model compiled (linear, a ``Network`` or
     a ``Polynomial``), otherwise to rounding. Only one block is in memory.
 
     Args:
-        model: what is simulated; ``LinearModel.to_model`` gives that of a linear one.
+        model: the model to simulate; for a linear one, ``LinearModel.to_model`` gives it.
         blocks: the input, physical units, one block after another, of any lengths.
-        x0: initial state in the model's coordinates. Default: 0. That of a measurement is
+        x0: initial state in the model's coordinates. Default: 0. The state of a measurement is
             ``model.signals(record, start="estimated").x[0, 0]``.
 
     Shape:
@@ -785,7 +790,7 @@ def simulate_blocks(
         >>> np.array_equal(y_hat, model.simulate(record.u))
         True
     """
-    # States keep all their digits from block to block, and signals those that the model has.
+    # States stay in float64 from block to block; signals have the dtype of the model.
     cell, scaler, like = double(model.lfr.cell), model.scaler, model.lfr.cell.A
     first, state = 0, torch.zeros(1, cell.nx, dtype=torch.float64)
     if x0 is not None:
@@ -844,7 +849,7 @@ def write_model(
     about: Mapping[str, Any] | None = None,
     known: Mapping[str, Tensor] | None = None,
 ) -> Path:
-    """Write the checkpoint of a model, and what is known of a linear one beside its numbers."""
+    """Write the checkpoint of a model, with ``about`` and ``known`` of a linear one."""
     cell, s = model.lfr.cell, model.scaler
     description = {
         "sizes": {"nu": cell.nu, "ny": cell.ny, "nx": cell.nx, "nz": cell.nz, "nw": cell.nw},
@@ -870,7 +875,7 @@ def write_model(
 def read_model(
     folder: str | Path, *, static: Module | None = None, inside: Sequence[str] = ("model", "linear")
 ) -> tuple[Model, dict[str, Any] | None, dict[str, Tensor]]:
-    """The model in a checkpoint, and what ``write_model`` was given of it besides."""
+    """Model in a checkpoint, with ``about`` and ``known`` of a linear one."""
     description, weights = checkpoint.read(folder, inside)
     own, _ = innermost(description)
     if not static and (name := foreign(own)):
@@ -898,7 +903,7 @@ def read_model(
 
 
 def _made(description: dict[str, Any], weights: dict[str, Tensor], static: Module | None) -> Model:
-    """The model of a description and its weights."""
+    """Model from a description and its weights."""
     sizes, dtype = description["sizes"], getattr(torch, description["dtype"])
     if not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
         raise InputError(f"dtype is {description['dtype']}")
@@ -923,7 +928,7 @@ def _made(description: dict[str, Any], weights: dict[str, Tensor], static: Modul
     z, y = (description.get(name, True) for name in ("z_feedthrough", "feedthrough"))
     for given in (
         {name: (mask != 0, cell.get_parameter(name).detach()) for name, mask in masks.items()},
-        held.structure(cell, named),  # of checkpoints of before, as what follows
+        held.structure(cell, named),  # as below: only checkpoints of earlier versions have it
         held.no_feedthrough(cell, z=z, y=y),
         held.integrators(cell) if cell.nw else {},
     ):
@@ -934,13 +939,13 @@ def _made(description: dict[str, Any], weights: dict[str, Tensor], static: Modul
 
 
 def _under(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Take the tensors whose names begin so, without that beginning."""
+    """Select the tensors whose names have a prefix, and remove it."""
     names = [name for name in weights if name.startswith(prefix)]
     return {name.removeprefix(prefix): weights.pop(name) for name in names}
 
 
 def _flat(reach: DataReach) -> dict[str, Array]:
-    """The arrays of a reach, for a checkpoint."""
+    """Arrays of a reach, for a checkpoint."""
     return {"u": reach.u, "y": reach.y, **{k: np.asarray(v) for k, v in vars(reach.z).items()}}
 
 

@@ -1,4 +1,4 @@
-"""States online: a model follows a running system, one sample after another."""
+"""Online observers: a model follows a running system, sample by sample."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from lfrtorch.engine.simulation_kernel import simulate_records
 
 
 class StateObserver(ABC):
-    """Follows the states of a running system: ``predict`` the output, then ``update`` by it.
+    """Observer of the states of a running system: ``predict`` the output, then ``update`` by it.
 
-    A controller that measures y before it chooses u calls ``correct(y)``, after which the states
-    know that output, and then ``advance(u)``; ``update`` does both with the input of ``predict``.
+    A controller that measures y before it chooses u calls ``correct(y)``, which updates the states
+    by that output, and then ``advance(u)``; ``update`` does both with the input of ``predict``.
 
-    It works in float64, in machine code if the static map is the package's own. ``Model.observer``
+    It works in float64, in machine code for the static maps of the package. ``Model.observer``
     makes one with the constant gain K, or an extended Kalman filter.
 
     Args:
-        cell, scaler, inputs, outputs: of the model.
-        x0: where the states begin, in the model's coordinates.
+        cell, scaler, inputs, outputs: parts of the model.
+        x0: initial states, in the model's coordinates.
         disturbances: number of the last states that are disturbances, in physical units.
 
     Shape:
@@ -65,7 +65,7 @@ class StateObserver(ABC):
         self._predicted, self._corrected = False, False
         fed_back = bool(cell.Dyw.any()) and bool(cell.Dzu.any())
         self._feedthrough = bool(cell.Dyu.any()) or fed_back
-        # Parts of those arrays: making one takes longer than a product of small matrices.
+        # Views of those arrays: making a view takes longer than a product of small matrices.
         self._u_now, self._y_hat = self._u[0, 0], self._y[0, 0]
         self._y_now, self._e, self._zero = np.zeros((3, cell.ny))
         at = scaler.u_offset, scaler.u_scale, scaler.y_offset, scaler.y_scale
@@ -79,10 +79,10 @@ class StateObserver(ABC):
 
     @property
     def state(self) -> Float[Array, " nx"]:
-        """The states, in the model's coordinates; they may be set, as after a change of the plant.
+        """States in the model's coordinates; they may be set, as after a change of the plant.
 
-        They are those at the next sample to be predicted, and after ``correct`` those that know the
-        output of this one.
+        They are predicted for the next sample; after ``correct`` they are the estimates given the
+        output of this sample.
 
         Raises:
             ValueError: another number of states, or some that are not finite.
@@ -95,7 +95,7 @@ class StateObserver(ABC):
 
     @property
     def disturbance(self) -> Float[Array, " nd"]:
-        """The disturbances, in physical units; they may be set. None without a disturbance model.
+        """Disturbances in physical units; they may be set. None without a disturbance model.
 
         Raises:
             ValueError: another number of disturbances, or some that are not finite.
@@ -107,7 +107,7 @@ class StateObserver(ABC):
         self._set(slice(self._own, None), "disturbance", d)
 
     def predict(self, u: ArrayLike) -> Float[Array, " ny"]:
-        """The output at this sample, from its input and all samples before it; physical units.
+        """Output at this sample, from its input and all samples before it; physical units.
 
         It may be called several times, for several inputs; the last one counts.
 
@@ -129,8 +129,8 @@ class StateObserver(ABC):
         """Go on to the next sample; returns the error of the prediction, y - y_hat.
 
         Args:
-            y: the output that was measured, (ny,) or a number, with NaN for one that is missing;
-                None if all are. The error of a missing output is NaN, and changes no state.
+            y: measured output, (ny,) or a number, with NaN for a missing one; None if all are
+                missing. The error of a missing output is NaN, and changes no state.
 
         Raises:
             ValueError: another number of outputs, an infinite one, or nothing was predicted.
@@ -145,8 +145,8 @@ class StateObserver(ABC):
     def correct(self, y: ArrayLike | None, u: ArrayLike | None = None) -> Float[Array, " ny"]:
         """Correct the states by the output of this sample; returns y - y_hat.
 
-        ``advance`` then goes on to the next sample. With the constant gain K the states stay: they
-        know all that the output tells of them, and the innovation enters the next ones.
+        ``advance`` then goes on to the next sample. A constant gain K leaves the states unchanged:
+        the innovation enters the next ones.
 
         Args:
             y: as in ``update``.
@@ -204,7 +204,7 @@ class StateObserver(ABC):
     def _step(self) -> None:
         """Write the output and the next states without noise."""
         if self._call is not None:
-            self._x_next.fill(np.nan)  # no trajectory that this one could meet
+            self._x_next.fill(np.nan)  # no other trajectory that could be met
             simulate_records(*self._call)
         else:
             with torch.no_grad():
@@ -225,7 +225,7 @@ class StateObserver(ABC):
 
     @abstractmethod
     def _go_on(self) -> None:
-        """Write the next states over those of now."""
+        """Replace the states by the next ones."""
 
 
 @final
@@ -233,8 +233,8 @@ class SteadyGainObserver(StateObserver):
     """The predictor of the innovation form: x+ = f(x, u) + K e.
 
     Args:
-        cell, scaler, inputs, outputs: of the model.
-        x0: where the states begin, in the model's coordinates.
+        cell, scaler, inputs, outputs: parts of the model.
+        x0: initial states, in the model's coordinates.
         K: innovation gain, normalised.
 
     Shape:
@@ -261,7 +261,7 @@ class SteadyGainObserver(StateObserver):
         self._K = K.double().cpu().numpy()
 
     def _correct(self) -> None:
-        """The states stay."""
+        """Leave the states unchanged."""
 
     def _go_on(self) -> None:
         e = self._e
@@ -279,10 +279,10 @@ def _sample(values: ArrayLike, channels: tuple[Channel, ...], name: str) -> Arra
     return found
 
 
-# A call of NumPy takes as long as a small model's step.
+# A call of NumPy costs as much time as a small model's step.
 @njit(cache=True, nogil=True, error_model="numpy")
 def _normalise(given, offset, scale, out):
-    """Write (given - offset) / scale into out; returns whether all given is finite."""
+    """Write (given - offset) / scale into out; return True if all given values are finite."""
     finite = True
     for i in range(len(out)):
         finite = finite and math.isfinite(given[i])
@@ -292,7 +292,7 @@ def _normalise(given, offset, scale, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _innovation(given, offset, scale, predicted, out, e):
-    """The same, with e = out - predicted; returns whether none is infinite: NaN is missing."""
+    """Write the same, and e = out - predicted; return True if none is infinite: NaN is missing."""
     _normalise(given, offset, scale, out)
     known = True
     for i in range(len(out)):

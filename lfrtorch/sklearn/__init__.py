@@ -1,4 +1,4 @@
-"""Identification as an estimator of scikit-learn."""
+"""Estimator of scikit-learn for identification."""
 
 from lfrtorch.sklearn.estimator import NLLFR
 

@@ -27,23 +27,23 @@ validation = imported("sklearn.utils.validation", "sklearn")
 class NLLFR(base.MultiOutputMixin, base.RegressorMixin, base.BaseEstimator):
     """A nonlinear LFR model: rows of X are samples of the inputs, in the order of time.
 
-    Samples are no draws: a split must keep records whole, or in one piece. ``groups`` of ``fit``
-    tells which record a row is of, and ``GroupKFold`` or ``LeaveOneGroupOut`` splits them. The
-    records of ``fit`` have no test; those that ``validation`` leaves out choose the iterate.
-    ``predict`` simulates its rows as one record from ``start``, and ``score`` is R² of that.
+    Samples are not independent: a split must keep records whole, or in one piece. ``groups`` of
+    ``fit`` has the record of each row, and ``GroupKFold`` or ``LeaveOneGroupOut`` splits by it. The
+    records of ``fit`` have no test; the part held out by ``validation`` chooses the iterate.
+    ``predict`` simulates its rows as one record from x = 0, and ``score`` is R² of that.
 
     Args:
         nx, nz, nw, nn, starts, ridge, seed: as in :class:`lfrtorch.Settings`.
         max_iter: iterations of Levenberg-Marquardt.
-        fs: sampling frequency in Hz; it is the unit of time of the model alone.
-        start: ``"zero"`` or ``"estimated"``, how a record of ``fit`` begins; a prediction begins at
-            x = 0, as there are no outputs.
+        fs: sampling frequency in Hz; it sets the unit of time of the model alone.
+        start: start of a record of ``fit``, ``"zero"`` or ``"estimated"``; a prediction begins at
+            x = 0, since there are no outputs.
         skip: samples at the beginning of every record of ``fit`` that do not count.
-        validation: the part of each record that chooses the iterate, its last one; 0 for none.
+        validation: last part of each record, which chooses the iterate; 0 for none.
 
     Attributes:
         model_: the :class:`lfrtorch.Model`.
-        run_: all that ``lfrtorch.identify`` found.
+        run_: the :class:`lfrtorch.Run`.
         n_iter_: iterations of the fit.
 
     Shape:
@@ -81,7 +81,7 @@ class NLLFR(base.MultiOutputMixin, base.RegressorMixin, base.BaseEstimator):
         self.fs, self.start, self.skip, self.validation = fs, start, skip, validation
 
     def fit(self, X: Any, y: Any, groups: ArrayLike | None = None) -> NLLFR:
-        """Identify a model; consecutive rows of one group are a record."""
+        """Identify a model; consecutive rows of a group are a record."""
         X, y = (columns_of(s, range(s.shape[1])) if is_frame(s) else s for s in (X, y))
         u, target = validation.validate_data(
             self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, ensure_min_samples=2
@@ -102,7 +102,7 @@ class NLLFR(base.MultiOutputMixin, base.RegressorMixin, base.BaseEstimator):
         return self
 
     def _by_use(self, records: Sequence[Record]) -> Dataset:
-        """The records, the last part of each for validation."""
+        """Divide the records: the last part of each is for validation."""
         if not 0.0 <= self.validation < 1.0:
             raise InputError(f"validation is {self.validation}; give a part from 0 to below 1.")
         parts = [cut(record, self.validation, 0.0) for record in records]
@@ -110,7 +110,7 @@ class NLLFR(base.MultiOutputMixin, base.RegressorMixin, base.BaseEstimator):
         return Dataset("arrays", [part["train"] for part in parts], chosen, [])
 
     def predict(self, X: Any) -> Array:
-        """The simulated output, (T,) or (T, ny), from x = 0."""
+        """Simulated output, (T,) or (T, ny), from x = 0."""
         validation.check_is_fitted(self)
         X = columns_of(X, range(X.shape[1])) if is_frame(X) else X
         u = validation.validate_data(self, X, reset=False, dtype=np.float64)
