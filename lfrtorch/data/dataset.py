@@ -45,13 +45,15 @@ class Undecided(NamedTuple):
     """A training record with an estimated start that may begin at rest.
 
     Args:
-        seen: what may tell it: the record without its test part.
+        record: the whole of it.
+        seen: its samples that may tell it, those before its test part.
         skip: samples of the training part that do not count if it begins at rest.
         places: numbers of its parts among the records of a use, by ``"train"``, ``"validation"``
             and ``"test"``.
     """
 
-    seen: Record
+    record: Record
+    seen: int
     skip: int
     places: Mapping[str, int]
 

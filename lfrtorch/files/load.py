@@ -192,7 +192,7 @@ def load_records(
             own = cut(whole.record, validated, tested)
             if whole.rest is not None and own["train"].samples - whole.rest >= SHORTEST:
                 places = {use: len(parts[use]) for use in own}
-                undecided.append(Undecided(whole.record[: whole.seen], whole.rest, places))
+                undecided.append(Undecided(whole.record, whole.seen, whole.rest, places))
             for use, record in own.items():
                 parts[use].append(record)
         except TooShortError as error:

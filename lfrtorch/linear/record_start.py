@@ -110,9 +110,9 @@ def decided(dataset: Dataset) -> Dataset:
     """Begin training records at rest that are undecided and clearly better so; notes say it."""
     open_, resting, notes = dataset.undecided, [], []
     for one in open_[:_TRIED]:
-        name = f"{one.seen.name}: " if len(dataset.train) > 1 else ""
+        name = f"{one.record.name}: " if len(dataset.train) > 1 else ""
         try:
-            trial = try_starts(one.seen)
+            trial = try_starts(one.record[: one.seen])
         except InputError:
             notes.append(f"{name}start is zero: no linear model tells how it begins")
             resting.append(one)
