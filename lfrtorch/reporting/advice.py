@@ -23,6 +23,7 @@ from lfrtorch.reporting.diagnosis import (
     UNEXPLAINED,
     Evidence,
 )
+from lfrtorch.reporting.sentences import Said, said
 
 _TRANSIENT = 3.0  # error in the first twentieth of the scored samples over that in the rest
 _CLOSE = 1.2  # growth as of OVERFIT, up to which a larger map is advised
@@ -54,28 +55,12 @@ class Advice(NamedTuple):
         return f"{self.text} ({self.evidence})"
 
 
-class _Number(float):
-    """A number in a sentence: {name:%} in per cent, {name} in three digits."""
-
-    def __format__(self, how: str) -> str:
-        return percent(float(self)) if how == "%" else number(float(self))
-
-
-class _Numbers(dict[str, Any]):
-    """What a sentence may name: a number of the evidence ``e``, and the change."""
-
-    def __missing__(self, name: str) -> Any:
-        value = getattr(self["e"], name)
-        unknown = math.nan if value is None else value
-        return _Number(unknown) if isinstance(unknown, float) else value
-
-
 class Rule(NamedTuple):
     """A row of the table: when it speaks, what it says and why, and what to change."""
 
     when: Callable[[Evidence], bool]
-    text: str | Callable[[Evidence], str]  # a string has numbers by name
-    because: str | Callable[[Evidence], str]  # likewise; empty if there is nothing to say
+    text: Said
+    because: Said  # empty if there is nothing to say
     change: Callable[[Evidence], Mapping[str, Any]] = lambda _: {}
     words: str = ""
     instead: str = ""  # of the change in the sentence, if there is none
@@ -85,11 +70,8 @@ class Rule(NamedTuple):
         if not self.when(e):
             return None
         change = self.change(e)
-        numbers = _Numbers(e=e, change=_written(change) or self.instead)
-        text, because = (
-            said.format_map(numbers) if isinstance(said, str) else said(e)
-            for said in (self.text, self.because)
-        )
+        text = said(self.text, e, change=_written(change) or self.instead)
+        because = said(self.because, e)
         return Advice(text, because, change or None, self.words) if because else None
 
 
@@ -165,13 +147,12 @@ def _map_is_small(e: Evidence) -> bool:
 def _not_noise(e: Evidence) -> str:
     """What shows that the error is not noise; empty if nothing does."""
     if not e.noise or e.train is None:
-        part = percent(e.nonlinear)
-        said = f"squares and cubes of the outputs explain {part} of the error's power"
-        return said * _above(e.nonlinear, NONLINEAR)
-    said = f"training error {number(e.train / e.noise)} times the noise"
+        part = f"explain {percent(e.nonlinear)} of the error's power"
+        return f"squares and cubes of the outputs {part}" * _above(e.nonlinear, NONLINEAR)
+    times = f"training error {number(e.train / e.noise)} times the noise"
     if e.linear is not None:
-        said += f", and only {percent(e.linear)} of its power linear in the inputs"
-    return said * (e.train > 1.5 * e.noise)  # from there on the model's own share is above it
+        times += f", and only {percent(e.linear)} of its power linear in the inputs"
+    return times * (e.train > 1.5 * e.noise)  # from there on the model's own share is above it
 
 
 def _far(e: Evidence) -> dict[str, float]:
