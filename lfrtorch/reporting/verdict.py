@@ -143,7 +143,7 @@ class _Compared(NamedTuple):
         return self.typical and not self.ratio < 1.0 - self.same
 
     @property
-    def said(self) -> float:
+    def told(self) -> float:
         """The ratio to speak of: that of the blocks if a runaway hides it."""
         return self.middle if self.hidden else self.ratio
 
@@ -222,9 +222,13 @@ def judge(
         error=error,
         refusals=refusals,
     )
-    kind, use, text = next(found for rule in _RULES if (found := rule(case)) is not None)
+    found = _unusable(case) or _unjudged(case)
+    if found is None:
+        assert whole is not None
+        found = _judged(case, whole)
+    kind, use, text = found
     if whole is not None and held_out and use != NEITHER:
-        own = whole.said * whole.linear_nrmse if whole.hidden else whole.nrmse
+        own = whole.told * whole.linear_nrmse if whole.hidden else whole.nrmse
         used = own if use == NL_LFR else whole.linear_nrmse
         if used >= EXPLAINS_NOTHING:
             use = NEITHER
@@ -237,89 +241,60 @@ def judge(
     return Verdict(kind, f"{text}{advice}.", use, evidence)
 
 
-def _diverges(case: _Case) -> _Found | None:
-    result, lost = case.result, case.lost
-    failed = result.reason in (Reason.GRADIENT_DIVERGED, Reason.JACOBIAN_VANISHES)
-    if not lost and not (failed and result.chosen_iteration == 0):
-        return None
-    what = f"diverges on {_names(lost)}" if lost else f"was not trained: {result.reason}"
-    if lost and all(nrmse(r.record, r.y_linear) >= EXPLAINS_NOTHING for r in lost):
-        text = f"The NL-LFR {what}, where {case.linear} explains nothing, either"
-        return Kind.DIVERGES, NEITHER, f"{text}: neither is usable"
-    return Kind.DIVERGES, LINEAR_MODEL, f"The NL-LFR {what}"
+def _unusable(c: _Case) -> _Found | None:
+    """A model that runs away, that was not found, or that is clearly worse on some record."""
+    lost = f"The NL-LFR diverges on {_names(c.lost)}" if c.lost else ""
+    if lost and all(nrmse(r.record, r.y_linear) >= EXPLAINS_NOTHING for r in c.lost):
+        nothing = f", where {c.linear} explains nothing, either: neither is usable"
+        return Kind.DIVERGES, NEITHER, lost + nothing
+    if lost:
+        return Kind.DIVERGES, LINEAR_MODEL, lost
+    failed = c.result.reason in (Reason.GRADIENT_DIVERGED, Reason.JACOBIAN_VANISHES)
+    if failed and c.result.chosen_iteration == 0:
+        return Kind.DIVERGES, LINEAR_MODEL, f"The NL-LFR was not trained: {c.result.reason}"
+    if c.worst is not None:
+        times = f"{number(c.worst.ratio)} times as large"
+        on = f"on {c.worst.name} the NL-LFR's {c.error} is {times}"
+        return Kind.WORSE, LINEAR_MODEL, f"Worse than {c.linear}: {on}"
+    return None
 
 
-def _worse(case: _Case) -> _Found | None:
-    if case.worst is None:
-        return None
-    text = (
-        f"Worse than {case.linear}: on {case.worst.name} the NL-LFR's {case.error} is "
-        f"{number(case.worst.ratio)} times as large"
-    )
-    return Kind.WORSE, LINEAR_MODEL, text
-
-
-def _training_alone(case: _Case) -> _Found | None:
-    if case.whole is None:
+def _unjudged(c: _Case) -> _Found | None:
+    """Nothing held out that is long enough, or that moves."""
+    if c.whole is None:
         return Kind.UNJUDGED, NL_LFR, f"Not judged: no record has {BLOCKS} samples"
-    if case.held_out:
-        return None
-    text = (
-        f"Not judged (nothing held out): on {case.whole.name} the {case.error} is "
-        f"{of_linear(case.whole.ratio)} (nx {case.nx})"
-    )
-    return Kind.UNJUDGED, NL_LFR if case.whole.ratio < 1.0 - SAME else LINEAR_MODEL, text
+    if not c.held_out:
+        on = f"on {c.whole.name} the {c.error} is {of_linear(c.whole.ratio)} (nx {c.nx})"
+        use = NL_LFR if c.whole.ratio < 1.0 - SAME else LINEAR_MODEL
+        return Kind.UNJUDGED, use, f"Not judged (nothing held out): {on}"
+    if not c.moves:
+        settled = f"{c.settled} settled and tells the gain alone"
+        return Kind.UNJUDGED, LINEAR_MODEL, f"Not decided beside {c.linear}: {settled}"
+    return None
 
 
-def _gain_alone(case: _Case) -> _Found | None:
-    if case.moves:
-        return None
-    text = f"Not decided beside {case.linear}: {case.settled} settled and tells the gain alone"
-    return Kind.UNJUDGED, LINEAR_MODEL, text
-
-
-def _better(case: _Case) -> _Found | None:
-    whole = case.whole
-    if whole is None or not whole.better:
-        return None
-    for refusal in case.refusals:
-        text = (
-            f"Not better than {case.linear}: the {case.error} is {percent(whole.said)} of its, "
-            f"but {refusal.text}"
-        )
-        return refusal.kind, LINEAR_MODEL, text
-    still = f" ({case.settled} settled)" if case.settled else ""
-    constant = ", itself worse than a constant" if whole.linear_nrmse > 1.0 else ""
-    text = f"Better than {case.linear}{constant}: on {whole.name} the NL-LFR's {case.error} is "
-    text += "in most blocks " * whole.hidden
-    text += f"{percent(whole.said)} of its" if constant or still else of_linear(whole.said)
-    return Kind.BETTER, NL_LFR, text + still
-
-
-def _alike(case: _Case) -> _Found | None:
-    whole = case.whole
+def _judged(c: _Case, whole: _Compared) -> _Found:
+    """A comparison on what was held out."""
+    told = f"{percent(whole.told)} of its"
+    on = f"on {whole.name} the"
+    if whole.better and c.refusals:
+        but = f"the {c.error} is {told}, but {c.refusals[0].text}"
+        return c.refusals[0].kind, LINEAR_MODEL, f"Not better than {c.linear}: {but}"
+    if whole.better:
+        still = f" ({c.settled} settled)" if c.settled else ""
+        constant = ", itself worse than a constant" * (whole.linear_nrmse > 1.0)
+        told = told if constant or still else of_linear(whole.told)
+        most = "in most blocks " * whole.hidden
+        text = f"Better than {c.linear}{constant}: {on} NL-LFR's {c.error} is {most}{told}{still}"
+        return Kind.BETTER, NL_LFR, text
     # Difference that three digits do not show, its standard error included.
-    if whole is None or abs(whole.ratio - 1.0) + whole.ratio_std >= 5e-4:
-        return None
-    kept = "the fit kept its start, and " * (case.result.chosen_iteration == 0)
-    text = f"As {case.linear}: {kept}on {whole.name} the errors are the same"
-    return Kind.LINEAR, LINEAR_MODEL, text
-
-
-def _not_better(case: _Case) -> _Found | None:
-    whole = case.whole
-    if whole is None:
-        return None
+    if abs(whole.ratio - 1.0) + whole.ratio_std < 5e-4:
+        kept = "the fit kept its start, and " * (c.result.chosen_iteration == 0)
+        return Kind.LINEAR, LINEAR_MODEL, f"As {c.linear}: {kept}{on} errors are the same"
     clearly = "clearly " * (whole.ratio < 1.0 - whole.same)
-    text = (
-        f"Not {clearly}better than {case.linear}: on {whole.name} the {case.error} is "
-        f"{number(100 * whole.ratio)} ± {number(100 * whole.ratio_std, 2)} % of its"
-    )
+    ratio = f"{number(100 * whole.ratio)} ± {number(100 * whole.ratio_std, 2)} % of its"
+    text = f"Not {clearly}better than {c.linear}: {on} {c.error} is {ratio}"
     return Kind.LINEAR, LINEAR_MODEL, text
-
-
-_RULES = (_diverges, _worse, _training_alone, _gain_alone, _better, _alike, _not_better)
-"""The first that speaks makes the verdict."""
 
 
 def judge_predictions(
