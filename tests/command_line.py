@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from omegaconf import DictConfig
 
-from lfrtorch.cli import fit
+from lfrtorch.cli import command
 from lfrtorch.cli.composition import composed
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -57,7 +57,7 @@ def configuration(*overrides: str) -> DictConfig:
 def launched(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
     """The command line in this process."""
     monkeypatch.setattr(sys, "argv", ["train.py", *words])
-    fit.launch()
+    command.start("fit")
 
 
 def file_overrides(csv: Path) -> list[str]:

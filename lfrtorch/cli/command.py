@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import version
 from typing import Any
@@ -39,27 +40,42 @@ def main() -> None:
 
 
 def start(command: str) -> None:
-    """Start a command; its help comes without what computes, which takes seconds to import."""
+    """Start a command; its help and its refusals come without what takes seconds to import."""
     if {"--help", "-h"}.isdisjoint(sys.argv):
-        logging.getLogger("numexpr").setLevel(logging.WARNING)  # pandas has it tell its threads
-        if command in ("fit", "linear"):
-            from lfrtorch.cli import early
+        from lfrtorch.cli import early
 
-            early.check("config" if command == "fit" else command)
+        early.take_words(config_name(command))
+        logging.getLogger("numexpr").setLevel(logging.WARNING)  # pandas has it tell its threads
         gc.disable()  # until all is imported: there is much of it, and nothing in it is garbage
-        module = import_module(f"lfrtorch.cli.{command}")
+        task = import_module(f"lfrtorch.cli.{command}").main
         gc.freeze()
         gc.enable()
-        module.launch()
     else:
-        import hydra
-
         from lfrtorch.cli import declared
-        from lfrtorch.cli.hydra_versions import MAIN
 
         declared.register()
-        name = "config" if command == "fit" else command
-        hydra.main(**MAIN, config_path=str(CONF), config_name=name)(lambda _: None)()
+        task = _nothing
+    run(command, task)
+
+
+def run(command: str, task: Callable[[Any], object]) -> None:
+    """Have Hydra compose the words of the program, which are whole, and start the task with it."""
+    import hydra
+
+    from lfrtorch.cli.errors import user_errors
+    from lfrtorch.cli.hydra_versions import MAIN
+
+    with user_errors():  # those of several runs, when all have ended
+        hydra.main(**MAIN, config_path=str(CONF), config_name=config_name(command))(task)()
+
+
+def _nothing(_: Any) -> None:
+    """Where Hydra prints its help and ends."""
+
+
+def config_name(command: str) -> str:
+    """The file in ``conf/`` of a command."""
+    return "config" if command == "fit" else command
 
 
 def versions() -> str:

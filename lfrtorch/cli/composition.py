@@ -1,21 +1,18 @@
-"""The words of a command line: those that no configuration takes end in one line of our own."""
+"""Words of a command line: completed, and those that no configuration takes refused in a line."""
 
 from __future__ import annotations
 
 import os
 import re
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from copy import deepcopy
 from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
 
-import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Glob, Override, QuotedString
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -24,9 +21,8 @@ from omegaconf.errors import OmegaConfBaseException
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import expanded
 from lfrtorch.cli import CONF, declared
-from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.hydra_versions import COMPOSED, MAIN
-from lfrtorch.cli.quotes import in_quotes, is_read, quoted
+from lfrtorch.cli.hydra_versions import COMPOSED
+from lfrtorch.cli.quotes import in_quotes, quoted, read
 from lfrtorch.files.excel import workbook
 from lfrtorch.files.formats import FORMATS, extension, similar
 
@@ -45,19 +41,6 @@ _DATA_CHOSEN = {"config", "linear", "evaluate", "preview"}
 _LISTS = {"data.inputs", "data.outputs", "data.reference"}
 
 
-def take_words(
-    command: str,
-    whole: Callable[[Sequence[str]], list[str]] = list,
-) -> None:
-    """Check the words, after ``whole`` has completed them, and quote them for Hydra."""
-    given = [of_newest(word) for word in in_full(command, sys.argv[1:])]
-    completed = whole(given)
-    if command == "config":
-        completed = [*completed, *chosen_by_data(completed)]
-    sys.argv[1:] = [quoted(word) for word in completed]
-    check_words(command, given, sys.argv[1:])
-
-
 def in_full(command: str, given: Sequence[str]) -> list[str]:
     """The words with all that follows from them: ``x.csv inputs=u`` are a file and its columns."""
     words = with_names(given)
@@ -73,7 +56,7 @@ def in_full(command: str, given: Sequence[str]) -> list[str]:
 def of_newest(word: str) -> str:
     """The word; if it names a folder of runs for a model, the newest of these in its place."""
     name, _, value = word.partition("=")
-    if name not in ("checkpoint", "init_from") or not is_read(quoted(word)):
+    if name not in ("checkpoint", "init_from") or not read(quoted(word)):
         return word
     folder = expanded(str(parsed(word).value()))
     runs = [run for run in folder.glob("*") if _DATE.fullmatch(run.name) and _has_model(run)]
@@ -136,116 +119,92 @@ def _may_be_file(word: str) -> bool:
 def _plain_or_quoted(option: str, path: str) -> str:
     """A path as a value, in quotes where Hydra would read it as something else."""
     word = f"{option}={path}"
-    return path if is_read(word) and parsed(word).value() == path else in_quotes(path)
+    found = read(word)
+    return path if found and found.value() == path else in_quotes(path)
 
 
 def _listed(word: str, *, several: bool) -> str:
     """Names of columns without brackets as a list; several of them are runs if there are some."""
     name, _, value = quoted(word).partition("=")
-    if name not in _LISTS or not is_read(f"{name}={value}"):
+    found = read(f"{name}={value}")
+    if name not in _LISTS or not found:
         return word
-    read = parsed(word).value()
-    if isinstance(read, ChoiceSweep):
-        single = read.simple_form and not several
+    given = found.value()
+    if isinstance(given, ChoiceSweep):
+        single = given.simple_form and not several
     else:
-        single = isinstance(read, str | int | QuotedString)
+        single = isinstance(given, str | int | QuotedString)
     return f"{name}=[{value}]" if single else word
 
 
 def in_groups(command: str, given: Sequence[str]) -> list[str]:
     """The words, with their group before the names that messages have: ``start=estimated``."""
-    own = {str(name) for name in OmegaConf.load(CONF / f"{command}.yaml")}
-    named = [word.partition("=")[0] if "=" in word else "" for word in given]
-    bare = {name for name in named if name.isidentifier()} - own
-    bare = {name for name in bare if not (CONF / name).is_dir()}
-    if not bare:
-        return list(given)
-    words = [parsed(word) for word, name in zip(given, named, strict=True) if name]
-    cfg = composed(command, [first_run(w) for w in words if is_choice(w)])
+    cfg = chosen(command, [parsed(word) for word in given if "=" in word])
     names = dict(spelt(_with_data(command, cfg)))
     return [
-        names.get(name, name) + word[len(name) :] if name in bare else word
-        for word, name in zip(given, named, strict=True)
+        names.get(name, name) + word[len(name) :]
+        for word, name in ((word, word.partition("=")[0]) for word in given)
     ]
 
 
-def started(
-    command: str,
-    work: Callable[[DictConfig], object],
-    whole: Callable[[Sequence[str]], list[str]] = list,
-) -> None:
-    """Start a command of one run; errors of users end it with a line."""
+def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) -> DictConfig | None:
+    """What the words compose; refuse those that Hydra would not take, or that nothing would read.
 
-    def job(cfg: DictConfig) -> None:
-        with user_errors():
-            work(cfg)
-
-    with user_errors():
-        take_words(command, whole)
-    hydra.main(**MAIN, config_path=str(CONF), config_name=command)(job)()
-
-
-def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) -> None:
-    """Refuse words that Hydra would not take, or would add where nothing reads them."""
+    Options of Hydra, as --help, compose nothing.
+    """
     # ``used`` may have words of an earlier run before them, which were taken then.
     if {word for word in given if word.startswith("-")} - SWEEPS:
-        return  # an option of Hydra, as --help
-    several = not SWEEPS.isdisjoint(given)
+        return None
     words, every = (
         [parsed(word) for word in line if word not in SWEEPS] for line in (given, used or given)
     )
+    cfg = chosen(command, every)
     for word in words:
-        if word.is_sweep_override() and not several:
-            raise InputError(several_values(command, word))
-        if word.is_delete() and "." not in word.key_or_group and word.key_or_group != "data":
-            raise InputError(
-                f"{word.key_or_group} cannot be taken away; leave out {word.input_line}."
-            )
-        if word.key_or_group == "bench" and not adds(word):
-            raise InputError(f"a benchmark is added to the settings: +{word.input_line}.")
-        folder = CONF / word.key_or_group
-        choices = sorted(path.stem for path in folder.glob("*.yaml"))
-        value = word.value()
-        chosen = not (value is None or isinstance(value, list) or word.is_sweep_override())
-        if choices and chosen and value not in choices:
-            raise InputError(f"there is no {word.key_or_group}={value}; give {', '.join(choices)}.")
-    # The values of a glob or an interval are known to the sweeper alone.
-    every = [w for w in every if not (isinstance(w.value(), Glob) or w.is_interval_sweep())]
-    cfg = composed(command, [first_run(word) for word in every if is_choice(word)])
-    for word in words:
+        if word.is_sweep_override() and SWEEPS.isdisjoint(given):
+            raise InputError(several_values(word, cfg))
         if not (is_choice(word) or word.is_delete() or taken(word, cfg)):
             raise InputError(unknown(command, word, cfg))
-    composed(command, [first_run(word) for word in every])
+    return _composed(CONF, command, _of_first_run(every))
+
+
+def chosen(command: str, words: Sequence[Override]) -> DictConfig:
+    """The configuration with the options of groups that words choose, and no other words."""
+    for word in words:
+        name, value = word.key_or_group, word.value()
+        if word.is_delete() and "." not in name and name != "data":
+            raise InputError(f"{name} cannot be taken away; leave out {word.input_line}.")
+        if name == "bench" and not adds(word):
+            raise InputError(f"a benchmark is added to the settings: +{word.input_line}.")
+        choices = sorted(path.stem for path in (CONF / name).glob("*.yaml"))
+        one = not (value is None or isinstance(value, list) or word.is_sweep_override())
+        if choices and one and value not in choices:
+            raise InputError(f"there is no {name}={value}; give {', '.join(choices)}.")
+    return _composed(CONF, command, _of_first_run(filter(is_choice, words)))
 
 
 def parsed(word: str) -> Override:
     """The word as Hydra reads it."""
-    try:
-        found = OverridesParser.create().parse_override(quoted(word))
-        if not found.key_or_group:
-            raise HydraException("no name")
+    found = read(quoted(word))
+    if found and found.key_or_group:
         return found
-    except HydraException:
-        if Path(word).is_dir():
-            raise InputError(
-                f"'{word}' is a folder: give its files, or checkpoint={word} if it has a model."
-            ) from None
-        if re.fullmatch(r"[\w./-]+", word):
-            raise InputError(
-                f"'{word}' is neither a setting, NAME=VALUE, nor a file{similar(expanded(word))}."
-            ) from None
+    if Path(word).is_dir():
         raise InputError(
-            f"'{word}' is not understood; write NAME=VALUE, and quotes around the word if a space, "
-            "a comma or a bracket stands in its value: \"NAME='VALUE'\"."
-        ) from None
+            f"'{word}' is a folder: give its files, or checkpoint={word} if it has a model."
+        )
+    if re.fullmatch(r"[\w./-]+", word):
+        raise InputError(
+            f"'{word}' is neither a setting, NAME=VALUE, nor a file{similar(expanded(word))}."
+        )
+    raise InputError(
+        f"'{word}' is not understood; write NAME=VALUE, and quotes around the word if a space, "
+        "a comma or a bracket stands in its value: \"NAME='VALUE'\"."
+    )
 
 
-def several_values(command: str, word: Override) -> str:
+def several_values(word: Override, cfg: DictConfig) -> str:
     """What is wrong with values that are neither a list nor several runs."""
     name, values = word.get_key_element(), word.get_value_string()
-    listed = name.startswith("data.") or isinstance(
-        OmegaConf.select(composed(command), name), ListConfig
-    )
+    listed = name.startswith("data.") or isinstance(OmegaConf.select(cfg, name), ListConfig)
     meant = f"for a list write {name}=[{values}], " if listed else ""
     return f"{name}={values} has several values: {meant}for a run of each of them add -m."
 
@@ -262,12 +221,18 @@ def first_run(word: Override) -> str:
     return f"{word.get_key_element()}={next(word.sweep_string_iterator())}"
 
 
+def _of_first_run(words: Iterable[Override]) -> tuple[str, ...]:
+    """The words, without globs and intervals, whose values the sweeper alone knows."""
+    known = (w for w in words if not (isinstance(w.value(), Glob) or w.is_interval_sweep()))
+    return tuple(map(first_run, known))
+
+
 def composed(command: str, words: Sequence[str] = ()) -> DictConfig:
     """The configuration; where Hydra cannot make one, the first line of its reason."""
     return deepcopy(_composed(CONF, command, tuple(words)))
 
 
-@lru_cache(maxsize=8)  # a command line is composed several times on its way, 0.1 s each
+@lru_cache(maxsize=8)  # the groups of a command line are composed twice, 0.1 s each
 def _composed(folder: Path, command: str, words: tuple[str, ...]) -> DictConfig:
     try:
         within = GlobalHydra.instance().is_initialized()  # a command of Hydra, at its end

@@ -14,11 +14,11 @@ from omegaconf import DictConfig, OmegaConf
 from torch.nn import Module
 
 import lfrtorch
-from lfrtorch._support.checks import integer, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines
+from lfrtorch.cli.checks import check_plain
+from lfrtorch.cli.errors import as_words
 from lfrtorch.cli.hydra_versions import instantiate
-from lfrtorch.cli.wording import as_words
 from lfrtorch.data.dataset import Dataset
 from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.fitting.settings import Settings
@@ -28,16 +28,7 @@ from lfrtorch.survey.notes import notes_on
 
 def configured(cfg: DictConfig) -> Settings:
     """The settings of an identification."""
-    require_data(cfg)
-    if cfg.nx is None and cfg.init_from is None and cfg.known._target_ is None:
-        raise InputError(
-            "nx, the number of states, is not set: add nx=2, for example, or nx=auto "
-            "(+bench=boucwen sets it and all else for that benchmark)."
-        )
-    for name in ("figures", "overwrite"):
-        true_or_false(name, cfg[name])
-    if cfg.dtype not in ("float32", "float64"):
-        raise InputError(f"dtype is {cfg.dtype}; give float64 or float32.")
+    check_plain(cfg)
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     return Settings(
         **{one.name: plain[one.name] for one in fields(PlainSettings)},
@@ -54,7 +45,6 @@ def configured(cfg: DictConfig) -> Settings:
 def limit_threads(cfg: DictConfig) -> None:
     """Compute on at most ``threads`` threads: more than there are cores cost time, up to hours."""
     if cfg.threads is not None:
-        integer("threads", cfg.threads, 1)
         torch.set_num_threads(min(cfg.threads, os.cpu_count() or 1))
 
 
@@ -102,12 +92,3 @@ def loaded(cfg: DictConfig) -> Dataset:
     for note in notes:
         print(in_lines(f"note: {note}"))
     return replace(dataset, notes=notes)
-
-
-def require_data(cfg: DictConfig) -> None:
-    """Say how data are chosen if none are."""
-    if cfg.get("data") is None:
-        raise InputError(
-            "no data chosen: add +bench=boucwen, or a file and its columns, "
-            "x.csv inputs=force outputs=disp fs=HZ nx=ORDER (or nx=auto)."
-        )

@@ -1,4 +1,4 @@
-"""What is wrong with the words of a fit, said before torch is imported, which takes seconds."""
+"""Check the command line before the slow import of torch: its words, settings and file."""
 
 from __future__ import annotations
 
@@ -7,63 +7,43 @@ import sys
 from dataclasses import fields
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import expanded
-from lfrtorch._support.settings import check_settings
-from lfrtorch.cli.composition import (
-    check_words,
-    chosen_by_data,
-    composed,
-    first_run,
-    in_full,
-    parsed,
-)
+from lfrtorch.cli import run_folder, sweep
+from lfrtorch.cli.checks import CHECKS
+from lfrtorch.cli.composition import SWEEPS, check_words, chosen_by_data, in_full, of_newest
 from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.quotes import quoted
 from lfrtorch.files.excel import EXTENSIONS, workbook
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.loggers import READERS
 from lfrtorch.files.measurement import Wanted, read_measurement
-from lfrtorch.fitting.plain_settings import PlainSettings
-from lfrtorch.least_squares.options import AdamOptions, LevenbergMarquardtOptions
 
 _SMALL = 2**22
 """Bytes of a file up to which it is read twice: a tenth of a second."""
 
-_SIZES = {"nx", "nz", "nw", "nn", "degree"}
 
-
-def check(command: str) -> None:
-    """End the program with a message if its words, numbers, file or columns cannot be."""
-    given = sys.argv[1:]
-    if any(word.startswith("-") or word.startswith("resume=") for word in given):
-        return  # several runs, options of Hydra, or the words of another run
-    with user_errors(os.environ.get("RANK", "0")):
-        words = in_full(command, given)
-        whole = [*words, *chosen_by_data(words)] if command == "config" else words
-        check_words(command, words, whole)
-        cfg = composed(command, [first_run(parsed(word)) for word in whole])
+def take_words(command: str) -> None:
+    """Complete the words of the program, and end it with a message if they cannot be."""
+    with user_errors():
+        given = [of_newest(word) for word in in_full(command, sys.argv[1:])]
+        words, several = given, not SWEEPS.isdisjoint(given)
+        if command in ("config", "linear"):
+            words = sweep.words_of_runs(given) if several else run_folder.arguments(given)
         if command == "config":
-            check_numbers(cfg)
-        check_file(cfg.get("data"))
-
-
-def check_numbers(cfg: DictConfig) -> None:
-    """Refuse plain settings beyond their limits."""
-    plain: Any = OmegaConf.to_container(cfg, resolve=True)
-    own = {one.name: plain[one.name] for one in fields(PlainSettings)}
-    brought = cfg.init_from is not None or cfg.known._target_ is not None
-    check_settings(PlainSettings(**own), without=_SIZES if brought else ())
-    trainer = plain["trainer"]
-    of_adam = str(trainer.get("_target_")).endswith("Adam")
-    kind: Any = AdamOptions if of_adam else LevenbergMarquardtOptions
-    names = {one.name for one in fields(kind)}
-    options = {k: v for k, v in trainer.items() if k in names and not isinstance(v, dict)}
-    try:
-        check_settings(kind(**options))
-    except InputError as error:
-        raise InputError(f"trainer: {error}") from None
+            words = [*words, *chosen_by_data(words)]
+        if several:  # their errors come to user_errors, and not as tracebacks
+            os.environ["HYDRA_FULL_ERROR"] = "1"
+        if os.environ.get("RANK", "0") != "0":
+            words = [*words, *run_folder.SILENT]
+        sys.argv[1:] = [quoted(word) for word in words]
+        cfg = check_words(command, given, sys.argv[1:])
+        if cfg is not None and not several:
+            CHECKS[command](cfg)
+            if command in ("config", "linear"):
+                check_file(cfg.data)
 
 
 def check_file(data: Any) -> None:

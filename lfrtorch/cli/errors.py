@@ -1,7 +1,9 @@
-"""Errors of users as one line."""
+"""Errors of users as one line, and notes in the words of the command line."""
 
 from __future__ import annotations
 
+import os
+import re
 import signal
 import sys
 from collections.abc import Iterator
@@ -16,8 +18,9 @@ from lfrtorch.cli.interrupts import TerminatedError, as_error, handled
 
 
 @contextmanager
-def user_errors(rank: str = "0") -> Iterator[None]:
+def user_errors() -> Iterator[None]:
     """Errors of users end the program with a message and exit code 1; bugs keep a traceback."""
+    rank = os.environ.get("RANK", "0")
     # A message names the group of the configuration, which a function's argument belongs to:
     # ``data: seed is -1``.
     error = "error" if rank == "0" else f"error on rank {rank}"
@@ -67,3 +70,10 @@ def _of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or (
         isinstance(error, RuntimeError) and "memory" in str(error) and "alloc" in str(error)
     )
+
+
+def as_words(note: str) -> str:
+    """Return a note with its settings as words of a command: feedthrough=false, start=zero."""
+    note = note.replace("by Record(valid=...) or ", "by ").replace(", or Record(valid=...)", "")
+    note = re.sub(r"\b(\w+)='(\w+)'", r"\1=\2", note)
+    return re.sub(r"\b(\w+)=(True|False)\b", lambda m: f"{m[1]}={m[2].lower()}", note)

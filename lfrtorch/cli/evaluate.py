@@ -16,13 +16,12 @@ from omegaconf import DictConfig
 
 import lfrtorch
 from lfrtorch._support.atomic import refuse_existing, whole_file
-from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import real
 from lfrtorch.analysis.residual_analysis import SHORTEST, Residuals, of_simulation
-from lfrtorch.cli.composition import started
-from lfrtorch.cli.config import loaded, require_data
+from lfrtorch.cli.checks import check_evaluation
+from lfrtorch.cli.config import loaded
+from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import CONFIG, program, read_settings
-from lfrtorch.cli.simulate import chosen, opened
 from lfrtorch.files.load import EVERYTHING, listed_files
 from lfrtorch.model.model import check_channels
 from lfrtorch.reporting import scores as report
@@ -35,14 +34,11 @@ _DIVIDES = "data.validation", "data.test"  # words that divide them by use
 def evaluate(cfg: DictConfig) -> None:
     """Print the scores of the checkpoint's model, and write them if that is asked for."""
     command = shlex.join([*program("scripts/evaluate.py"), *HydraConfig.get().overrides.task])
-    folder = chosen(cfg)
-    require_data(cfg)
-    if cfg.out is not None:
-        if Path(str(cfg.out)).suffix.lower() != ".json":
-            raise InputError(f"out is '{cfg.out}'; the scores are JSON: name it FILE.json.")
-        if not cfg.overwrite:
-            refuse_existing(cfg.out, "overwrite=true")
-    model, bla = opened(folder), linear_beside(folder)
+    check_evaluation(cfg)
+    folder = str(cfg.checkpoint)
+    if cfg.out is not None and not cfg.overwrite:
+        refuse_existing(cfg.out, "overwrite=true")
+    model, bla = lfrtorch.load(folder), linear_beside(folder)
     if cfg.data._target_ == _FILES:
         from_files(cfg, model, command)
     dataset = loaded(cfg).with_windows()
@@ -114,6 +110,5 @@ def linear_beside(checkpoint: str) -> lfrtorch.LinearModel | None:
     return None if found is None else lfrtorch.LinearModel.load(found)
 
 
-def launch() -> None:
-    """The command."""
-    started("evaluate", evaluate)
+main = user_errors()(evaluate)
+"""The command."""

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+import lfrtorch
 from lfrtorch import export
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.cli.composition import started
-from lfrtorch.cli.simulate import chosen, introduced, opened
+from lfrtorch.cli.checks import check_checkpoint
+from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.simulate import introduced
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.extended_kalman_filter import NoiseCovariance
 from lfrtorch.model.model import Model
@@ -22,11 +24,11 @@ from lfrtorch.model.model import Model
 
 def written(cfg: DictConfig) -> None:
     """Write the files, and say how they are used."""
-    folder = chosen(cfg)
+    check_checkpoint(cfg)
     if cfg.to is None:
         raise InputError(f"to is not set: add to=c, or another of {', '.join(export.TARGETS)}.")
-    model = opened(folder)
-    print(introduced(folder, model))
+    model = lfrtorch.load(str(cfg.checkpoint))
+    print(introduced(cfg.checkpoint, model))
     name, observer = str(cfg.name), observer_of(cfg, model)
     paths = export.write(
         model, str(cfg.to), cfg.out, name=name, overwrite=cfg.overwrite, observer=observer,
@@ -61,6 +63,5 @@ def _variances(name: str, given: Any) -> Array:
         ) from None
 
 
-def launch() -> None:
-    """The command."""
-    started("export", written)
+main = user_errors()(written)
+"""The command."""

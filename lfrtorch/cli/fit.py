@@ -13,42 +13,36 @@ import os
 import shlex
 import shutil
 import signal
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import hydra
+import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.reasons import Reason
-from lfrtorch.cli import CONF, sweep
-from lfrtorch.cli.composition import take_words
+from lfrtorch.cli import sweep
 from lfrtorch.cli.config import configured, limit_threads, loaded
 from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.hydra_versions import MAIN
 from lfrtorch.cli.interrupts import TerminatedError, Termination
 from lfrtorch.cli.run_folder import (
     CONFIG,
     SNAPSHOTS,
     STARTS,
     USED,
-    arguments,
     chosen_before,
-    common,
     go_on,
     no_empty_folder,
     program,
     resumable,
-    world,
 )
 from lfrtorch.data.dataset import Dataset
-from lfrtorch.distributed import ProcessLostError, connect, current
+from lfrtorch.distributed import ProcessLostError, agreed, connect, current
 from lfrtorch.fitting.observer import Watching
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.snapshots import Snapshots
@@ -156,7 +150,6 @@ class _Folder(Console):
             board.close()
 
 
-@hydra.main(**MAIN, config_path=str(CONF), config_name="config")
 def main(cfg: DictConfig) -> float:
     """The command line."""
     job = HydraConfig.get()
@@ -173,28 +166,17 @@ def launched(cfg: DictConfig, folder: Path, command: str) -> float:
     """One run, by all processes that torchrun started; errors of users end the program."""
     rank = os.environ.get("RANK", "0")
     with ExitStack() as stack:
-        stack.enter_context(user_errors(rank))
+        stack.enter_context(user_errors())
         stack.enter_context(quiet_writers())
         if rank == "0":
             stack.enter_context(no_empty_folder(folder))
         if stack.enter_context(connect(cfg.device, cfg.timeout)).rank > 0:
             stack.enter_context(redirect_stdout(stack.enter_context(open(os.devnull, "w"))))
-        return run(cfg, common(folder), command)
+        return run(cfg, _common(folder), command)
     raise AssertionError  # user_errors does not return
 
 
-def launch() -> None:
-    """``main``; of several processes the first alone has Hydra write files."""
-    several = sweep.asked(sys.argv)
-    if world() > 1 and several:
-        sys.exit("error: torchrun shares one fit; start several runs one after another.")
-    with user_errors(os.environ.get("RANK", "0")):
-        take_words("config", sweep.words_of_runs if several else arguments)
-    if world() > 1 and os.environ["RANK"] != "0":
-        # Settings of Hydra for all processes but the first.
-        sys.argv += ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none"]
-    if several:
-        with user_errors():
-            sweep.launched(main)
-    else:
-        main()
+def _common(folder: Path) -> Path:
+    """The first process's folder."""
+    name = torch.tensor(list(str(folder).encode()), dtype=torch.uint8)
+    return Path(bytes(agreed(name).tolist()).decode())

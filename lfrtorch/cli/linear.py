@@ -18,10 +18,10 @@ import lfrtorch
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines
-from lfrtorch.cli.composition import started
 from lfrtorch.cli.config import configured, limit_threads, loaded
+from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.hydra_versions import instantiate
-from lfrtorch.cli.run_folder import CONFIG, arguments, no_empty_folder, program
+from lfrtorch.cli.run_folder import CONFIG, no_empty_folder, program
 from lfrtorch.fitting.linear_start import linear_model, linear_records
 from lfrtorch.linear.requirements import of_response
 from lfrtorch.reporting import linear_report
@@ -85,13 +85,10 @@ def wants_response(cfg: DictConfig, records: Sequence[lfrtorch.Record]) -> bool:
     return cfg.bla.refine == "frequency" or (cfg.bla.refine is None and of_response(records))
 
 
-def launch() -> None:
-    """The command, with the settings of the run in ``resume=DIR`` before its words."""
-
-    def work(cfg: DictConfig) -> None:
-        run = HydraConfig.get()
-        folder = Path(run.runtime.output_dir)
-        with no_empty_folder(folder):
-            identify(cfg, folder, shlex.join([*program("scripts/bla.py"), *run.overrides.task]))
-
-    started("linear", work, arguments)
+@user_errors()
+def main(cfg: DictConfig) -> None:
+    """The command."""
+    run = HydraConfig.get()
+    folder = Path(run.runtime.output_dir)
+    with no_empty_folder(folder):
+        identify(cfg, folder, shlex.join([*program("scripts/bla.py"), *run.overrides.task]))

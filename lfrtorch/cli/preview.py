@@ -13,8 +13,8 @@ from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import real
-from lfrtorch.cli.composition import started
-from lfrtorch.cli.wording import as_words
+from lfrtorch.cli.checks import check_preview
+from lfrtorch.cli.errors import as_words, user_errors
 from lfrtorch.data.periods import find_period
 from lfrtorch.data.records import Record, check_rate
 from lfrtorch.files.formats import open_table
@@ -28,16 +28,11 @@ from lfrtorch.survey.notes import examine
 FIGURES = (".png", ".pdf", ".svg")
 
 
-def launch() -> None:
-    """The command."""
-    started("preview", preview)
-
-
-def preview(cfg: DictConfig) -> None:
+@user_errors()
+def main(cfg: DictConfig) -> None:
     """Look at each file."""
-    data = cfg.get("data")
-    if data is None or data.get("path") is None:
-        raise InputError("no file is named; give its path, or path=FILE.")
+    check_preview(cfg)
+    data = cfg.data
     if data.fs is not None:
         check_rate("fs", data.fs)
     paths = listed_files(data.path, "path")

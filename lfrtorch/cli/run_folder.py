@@ -11,14 +11,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
-import torch
 import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.paths import expanded
-from lfrtorch.distributed import agreed
 
 CONFIG, SNAPSHOTS, STARTS = "config.yaml", "resume", "starts"
 """In the folder of a run: its settings, its starts as far as they came, and events of those that go
@@ -29,6 +27,10 @@ USED = "used"
 
 OVERRIDES = Path(".hydra", "overrides.yaml")
 """There, too: the words of its command line."""
+
+
+SILENT = ("hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none")
+"""Settings of Hydra for all processes of a fit but the first, which alone has it write files."""
 
 
 def world() -> int:
@@ -126,12 +128,6 @@ def resumable(folder: Path) -> Iterator[None]:
         if not (folder / SNAPSHOTS).is_dir():
             raise
         raise OSError(f"{error}; {go_on(folder)}") from error
-
-
-def common(folder: Path) -> Path:
-    """The first process's folder."""
-    name = torch.tensor(list(str(folder).encode()), dtype=torch.uint8)
-    return Path(bytes(agreed(name).tolist()).decode())
 
 
 @contextmanager

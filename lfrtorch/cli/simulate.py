@@ -11,15 +11,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig
 
 import lfrtorch
 from lfrtorch._support import tables
 from lfrtorch._support.atomic import refuse_existing
-from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import expanded, real
-from lfrtorch.cli.composition import started
+from lfrtorch.cli.checks import check_simulation
+from lfrtorch.cli.errors import user_errors
 from lfrtorch.files.load import listed_files
 from lfrtorch.files.stream import FileStream
 from lfrtorch.files.writer import FORMATS
@@ -37,11 +37,10 @@ from lfrtorch.use.file_simulation import (
 
 def simulate(cfg: DictConfig) -> None:
     """Simulate every file, write what comes out, and print the scores."""
-    folder = chosen(cfg)
-    require(cfg)
+    check_simulation(cfg)
     pairs = targets(cfg)
-    model = opened(folder)
-    print(introduced(folder, model))
+    model = lfrtorch.load(str(cfg.checkpoint))
+    print(introduced(cfg.checkpoint, model))
     check_rate(cfg, model)
     rows = []
     for path, out in pairs:
@@ -102,56 +101,11 @@ def scored(path: Path, model: lfrtorch.Model, result: Simulated) -> list[list[ta
     ]
 
 
-def chosen(cfg: DictConfig) -> str:
-    """The folder of the model."""
-    if cfg.checkpoint is None:
-        raise InputError(
-            "checkpoint is not set: add checkpoint=DIR, the folder of a run or of a saved model."
-        )
-    return str(cfg.checkpoint)
-
-
-def opened(folder: str) -> lfrtorch.Model:
-    """The model of a checkpoint, a linear one as an NL-LFR without static nonlinearity."""
-    return lfrtorch.load(folder)
-
-
 def introduced(folder: str, model: lfrtorch.Model) -> str:
     """Channels, rate and sizes in a line."""
     sizes = ", ".join(f"{name} {size}" for name, size in model.sizes.items() if size)
     u, y = (", ".join(map(str, channels)) for channels in (model.inputs, model.outputs))
     return f"{folder}: {u} -> {y} at {model.fs:g} Hz, {sizes}"
-
-
-def require(cfg: DictConfig) -> None:
-    """Say what is missing or wrong on the command line before anything is read."""
-    for option, value, example in (
-        ("data.path", cfg.data.path, "FILE, the file of inputs"),
-        ("out", cfg.out, "FILE.csv, which is written, or for several files a FOLDER"),
-    ):
-        if value is None:
-            raise InputError(f"{option} is not set: add {option}={example}.")
-    if isinstance(cfg.out, DictConfig | ListConfig):
-        raise InputError(f"out is {cfg.out}; give a file or a folder.")
-    if cfg.start not in ("zero", "given", "estimated", "measured"):
-        raise InputError(
-            f"start is {cfg.start!r}; give zero, given (with x0=[...]), estimated or measured."
-        )
-    if (cfg.start == "given") != (cfg.x0 is not None):
-        raise InputError(
-            f"start is {cfg.start!r} and x0 is {cfg.x0}; "
-            "a start state goes with start=given, and only with it."
-        )
-    x0 = cfg.x0 if isinstance(cfg.x0, ListConfig | None) else [None]
-    if not all(isinstance(x, int | float) and np.isfinite(x) for x in x0 or []):
-        raise InputError(f"x0 is {cfg.x0}; give a list of finite numbers, one a state.")
-    for name, least in (("estimate", 1), ("skip", 0)):
-        if cfg[name] is not None:
-            integer(name, cfg[name], least)
-    if cfg.data.fs is not None:
-        number("data.fs", cfg.data.fs, positive=True)
-    if f".{cfg.format}" not in FORMATS:
-        raise InputError(f"format is {cfg.format!r}; give csv, npz or parquet.")
 
 
 def targets(cfg: DictConfig) -> list[tuple[Path, Path]]:
@@ -195,6 +149,5 @@ def about(path: Path) -> Iterator[None]:
         raise InputError(f"'{path}': {error}") from error
 
 
-def launch() -> None:
-    """The command."""
-    started("simulate", simulate)
+main = user_errors()(simulate)
+"""The command."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from hashlib import sha256
 from importlib.util import find_spec
@@ -13,8 +12,9 @@ from urllib.parse import quote
 from hydra.types import RunMode
 
 from lfrtorch._support.errors import InputError, LfrtorchError
-from lfrtorch.cli.composition import SWEEPS, parsed
+from lfrtorch.cli.composition import parsed
 from lfrtorch.cli.quotes import register_resolver
+from lfrtorch.cli.run_folder import world
 
 _LONGEST = 120  # characters of a folder's name; file systems take 255 bytes
 
@@ -41,13 +41,10 @@ def folder_name(varied: str) -> str:
 register_resolver("folder_name", folder_name, replace=True)
 
 
-def asked(given: Sequence[str]) -> bool:
-    """Whether the command line asks for several runs."""
-    return not SWEEPS.isdisjoint(given)
-
-
 def words_of_runs(given: Sequence[str]) -> list[str]:
     """The command line of several runs, with what names their folders."""
+    if world() > 1:
+        raise InputError("torchrun shares one fit; start several runs one after another.")
     if any(word.startswith("resume=") for word in given):
         raise InputError("resume is of one run; give it without -m.")
     words = [parsed(word) for word in given if not word.startswith("-")]
@@ -79,9 +76,3 @@ def one_of_several(run: Callable[[], float], folder: Path, *, overwrite: bool) -
         if end.code != 1:
             raise
         raise RunFailedError(f"the run {folder.name} failed; what it printed says why.") from None
-
-
-def launched(main: Callable[[], Any]) -> None:
-    """Start the runs; Hydra raises the error of the first that failed when all have ended."""
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, and not as a traceback
-    main()

@@ -38,9 +38,9 @@ OWN = {"linear": ("data/file", "bla/state_space"), "evaluate": ("data/file",)}
 
 
 def test_garbage_is_collected_again_when_all_is_imported(monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["lfrtorch evaluate"])
-    monkeypatch.setattr("lfrtorch.cli.evaluate.launch", lambda: None)
-    command.start("evaluate")
+    monkeypatch.setattr(sys, "argv", ["lfrtorch preview", "x.csv"])
+    monkeypatch.setattr(command, "run", lambda *_: None)
+    command.start("preview")
     assert gc.isenabled()
 
 
@@ -91,7 +91,7 @@ from lfrtorch.cli import command
 def load(name):
     os.kill(os.getpid(), {number})
 command.import_module = load
-sys.argv = ["lfrtorch", "fit"]
+sys.argv = ["lfrtorch", "preview", "x.csv"]
 command.main()
 """
 

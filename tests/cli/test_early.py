@@ -11,7 +11,15 @@ import pytest
 
 from lfrtorch.cli import early
 
-ENDS = "import sys; from lfrtorch.cli.command import start; sys.argv = ['lfrtorch fit', *{words}]"
+ENDS = """
+import sys
+from lfrtorch.cli.command import start
+sys.argv = ["lfrtorch", *{words}]
+try:
+    start({command!r})
+finally:
+    assert "torch" not in sys.modules
+"""
 
 
 @pytest.fixture
@@ -31,6 +39,10 @@ def file(tmp_path: Path) -> Path:
         (["nx=3", "inputs=power"], "has no column 'power', named in inputs"),
         (["nx=3", "fs=null"], "data: the sampling frequency of 'x.csv' is not known; give fs=HZ"),
         (["nx=3", "fs=-1"], "data: fs is -1; give a positive number"),
+        (["nx=3", "noise=both"], "noise is 'both'; give 'output' or 'innovation'."),
+        (["nx=3", "structure=wiener", "modes=1"], "and modes is 1: its w drives no states; give"),
+        (["nx=3", "dtype=float16"], "dtype is float16; give float64 or float32."),
+        (["resume=runs/nowhere"], "resume is 'runs/nowhere', which is not the folder of a run"),
         (["+bench=boucwe"], "there is no bench=boucwe; give boucwen"),
     ],
 )
@@ -39,11 +51,28 @@ def test_errors_come_before_torch(file: Path, words: list[str], message: str):
     for word in ("inputs=force", "fs=100"):
         if known and not any(other.startswith(word.split("=")[0]) for other in words):
             known.append(word)
-    code = ENDS.format(words=[*known, *words])
-    code += "\ntry:\n    start('fit')\nfinally:\n    assert 'torch' not in sys.modules"
+    refused("fit", [*known, *words], message, file.parent)
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "message"),
+    [
+        ("linear", ["x.csv", "fs=100", "nx=0"], "nx is 0; give a whole number of at least 1"),
+        ("evaluate", ["x.csv"], "checkpoint is not set: add checkpoint=DIR"),
+        ("simulate", ["x.csv", "checkpoint=m", "out=y.csv", "skip=-1"], "skip is -1; give a whole"),
+        ("export", ["to=c"], "checkpoint is not set: add checkpoint=DIR"),
+        ("preview", ["+bench=boucwen"], "no file is named; give its path, or path=FILE."),
+    ],
+)
+def test_so_do_those_of_other_commands(file: Path, command: str, words: list[str], message: str):
+    refused(command, words, message, file.parent)
+
+
+def refused(command: str, words: list[str], message: str, folder: Path) -> None:
     ended = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=file.parent, check=False
-    )
+        [sys.executable, "-c", ENDS.format(words=words, command=command)],
+        capture_output=True, text=True, cwd=folder, check=False,
+    )  # fmt: skip
     assert ended.returncode == 1
     assert message in ended.stderr.replace("\n  ", " ")
     assert "Traceback" not in ended.stderr
@@ -55,8 +84,7 @@ def test_what_is_right_passes(file: Path, monkeypatch: pytest.MonkeyPatch):
         ["+bench=boucwen"],
         ["+bench=boucwen", "trainer=adam", "trainer.max_iter=5"],
         ["-m", "+bench=boucwen", "nx=1,2"],
-        ["resume=runs/nowhere"],
         ["+bench=nanodrone", "data.root=nowhere"],
     ):
         monkeypatch.setattr(sys, "argv", ["lfrtorch fit", *words])
-        early.check("config")
+        early.take_words("config")

@@ -107,8 +107,9 @@ def test_an_argument_that_there_is_not_is_an_error_of_the_user(capsys):
     )
 
 
-def test_other_ranks_say_which_they_are(tmp_path: Path, capsys):
-    with pytest.raises(SystemExit), user_errors("1"):
+def test_other_ranks_say_which_they_are(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setenv("RANK", "1")
+    with pytest.raises(SystemExit), user_errors():
         (tmp_path / "no").read_text()
     assert capsys.readouterr().err.startswith("error on rank 1: ")
 

@@ -16,7 +16,7 @@ from command_line import configuration, file_overrides
 from reference import measure, random_cell, random_model
 
 import lfrtorch
-from lfrtorch.cli import composition, evaluate, fit
+from lfrtorch.cli import command, evaluate, fit
 from lfrtorch.data.dataset import Dataset, Published
 
 MODEL = random_model(random_cell(), fs=50.0)
@@ -55,8 +55,7 @@ def run_folder(tmp_path: Path) -> Path:
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
     monkeypatch.setattr(sys, "argv", ["evaluate.py", *words])
-    monkeypatch.setattr(composition, "take_words", lambda *_: None)  # data of these tests
-    evaluate.launch()
+    command.run("evaluate", evaluate.main)  # with data of these tests
 
 
 @pytest.mark.numeric

@@ -11,7 +11,7 @@ from exported import MODELS, OBSERVED
 
 from lfrtorch import NoiseCovariance
 from lfrtorch import export as exports
-from lfrtorch.cli import composition, export
+from lfrtorch.cli import command, early
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
     monkeypatch.setattr("sys.argv", ["lfrtorch export", *words])
-    export.launch()
+    command.start("export")
 
 
 def test_c_is_written_with_its_use(folder: Path, monkeypatch, capsys):
@@ -50,8 +50,8 @@ def test_a_folder_of_runs_stands_for_the_newest(folder: Path, monkeypatch, capsy
     (folder / "runs" / "run" / dates[1]).rename(folder / "elsewhere")
     run(monkeypatch, "checkpoint=runs/run", "to=c", "name=before")
     assert f"checkpoint is runs/run/{dates[0]}" in capsys.readouterr().out
-    monkeypatch.setattr("sys.argv", ["lfrtorch fit", "init_from=runs/run", "nx=2"])
-    composition.take_words("config")
+    monkeypatch.setattr("sys.argv", ["lfrtorch fit", "+bench=boucwen", "init_from=runs/run"])
+    early.take_words("config")
     assert f"init_from=runs/run/{dates[0]}" in sys.argv
 
 

@@ -35,7 +35,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 import lfrtorch
 from lfrtorch import InputError
-from lfrtorch.cli import claim, config, errors, evaluate, fit, interrupts, run_folder
+from lfrtorch.cli import claim, command, config, errors, fit, interrupts, run_folder
 from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.datasets import boucwen, f16, official
 from lfrtorch.reporting import plots
@@ -411,7 +411,7 @@ def test_a_run_of_before_there_were_structures_goes_on_and_is_scored(csv, tmp_pa
     monkeypatch.setattr(
         sys, "argv", ["evaluate.py", f"checkpoint={folder}", f"out={out}", *file_overrides(csv)]
     )
-    evaluate.launch()
+    command.start("evaluate")
     scores = json.loads(out.read_text())["scores"]
     assert scores["test"]["rmse"] == pytest.approx(metrics["scores"]["test"]["rmse"], rel=1e-9)
 
@@ -526,7 +526,7 @@ def test_damaged_settings_of_a_run_that_goes_on(tmp_path: Path, text: str):
 def refused(monkeypatch, capsys, *words: str) -> str:
     """What the command line says as it ends."""
     with pytest.raises(SystemExit) as end:
-        launched(monkeypatch, *words)
+        launched(monkeypatch, "+bench=silverbox", "data.root=/nowhere", *words)
     assert end.value.code == 1
     return capsys.readouterr().err
 

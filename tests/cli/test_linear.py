@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
-from lfrtorch.cli import composition, errors, fit, linear
+from lfrtorch.cli import command, errors, fit, linear
 from lfrtorch.cli.composition import composed
 from lfrtorch.data.dataset import Dataset
 from lfrtorch.data.records import Record
@@ -68,8 +68,7 @@ def overrides(csv: Path, inputs: str, outputs: str, *more: str) -> list[str]:
 def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> dict:
     """linear.json of a run."""
     monkeypatch.setattr(sys, "argv", ["bla.py", f"hydra.run.dir='{folder}'", *words])
-    monkeypatch.setattr(composition, "take_words", lambda *_: None)  # data of these tests
-    linear.launch()
+    command.run("linear", linear.main)  # with data of these tests
     return json.loads((folder / "linear.json").read_text())
 
 

@@ -13,7 +13,7 @@ from scipy.io import savemat
 from scipy.signal import lfilter
 
 from lfrtorch._support.tables import number
-from lfrtorch.cli import config, preview
+from lfrtorch.cli import command, config, preview
 from lfrtorch.data.records import Channel
 from lfrtorch.files import measurement
 from lfrtorch.files.formats import open_table
@@ -55,7 +55,7 @@ def run(tmp_path, capsys, monkeypatch):
 
     def run(*words: str | Path) -> str:
         monkeypatch.setattr("sys.argv", ["lfrtorch preview", *map(str, words)])
-        preview.launch()
+        command.start("preview")
         printed = capsys.readouterr()
         assert printed.err == ""
         return printed.out
@@ -74,7 +74,7 @@ def refused(capsys, *words: str | Path) -> str:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["lfrtorch preview", *map(str, words)])
         with pytest.raises(SystemExit) as stop:
-            preview.launch()
+            command.start("preview")
     assert stop.value.code == 1
     return capsys.readouterr().err
 

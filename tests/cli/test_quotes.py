@@ -11,7 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 import lfrtorch
-from lfrtorch.cli import evaluate, linear, simulate
+from lfrtorch.cli import command, linear
 from lfrtorch.cli.composition import composed
 from lfrtorch.cli.quotes import quoted
 from lfrtorch.files.formats import open_table
@@ -92,15 +92,15 @@ def test_a_run_on_names_of_any_alphabet(csv: Path, tmp_path, monkeypatch, capsys
     launched(monkeypatch, f"resume={run}", "trainer.max_iter=2")
     model = lfrtorch.load(str(run))
     assert [*map(str, (*model.inputs, *model.outputs))] == [FLOW, LEVEL]
-    for command, words in (
-        (simulate, [f"data.path={lab}", "out=ŷ.csv", "data.fs=10", f"data.outputs=[{LEVEL}]"]),
-        (evaluate, data),
+    for name, words in (
+        ("simulate", [f"data.path={lab}", "out=ŷ.csv", "data.fs=10", f"data.outputs=[{LEVEL}]"]),
+        ("evaluate", data),
     ):
         monkeypatch.setattr("sys.argv", ["lfrtorch", f"checkpoint={run}", *words])
-        command.launch()
+        command.start(name)
     assert "Füllstand_hat" in [column.name for column in open_table(tmp_path / "ŷ.csv").columns]
     assert "Füllstand" in capsys.readouterr().out
     monkeypatch.setattr("sys.argv", ["lfrtorch", *data, "nx=1", "bla.max_iter=1"])
     monkeypatch.setattr(linear, "identify", lambda cfg, *_: print(cfg.data.outputs))
-    linear.launch()
+    command.start("linear")
     assert LEVEL in capsys.readouterr().out

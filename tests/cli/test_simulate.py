@@ -18,7 +18,7 @@ from reference import random_cell, random_model
 
 import lfrtorch
 from lfrtorch._support.types import Array
-from lfrtorch.cli import evaluate, simulate
+from lfrtorch.cli import command, simulate
 from lfrtorch.cli.composition import composed
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.files.formats import open_table
@@ -67,7 +67,7 @@ def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> None:
 def launched(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", ["simulate.py", "checkpoint=model", *words])
-    simulate.launch()
+    command.start("simulate")
 
 
 def refused(monkeypatch, capsys, folder: Path, *words: str) -> str:
@@ -294,7 +294,7 @@ def test_evaluate_scores_the_same_samples(
     here = [line[3:] for line in lines if line[:1] == ["x.csv"]]
     words = ["data=file", *given, f"data.start={start}", "out=scores.json"]
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "checkpoint=model", *words])
-    evaluate.launch()
+    command.start("evaluate")
     score = json.loads((folder / "scores.json").read_text())["scores"]["x"]
     skip = {"estimated": min(50, samples // 5), "zero": period or round(samples / 20)}[start]
     said = f"last {samples - skip} of {samples}"

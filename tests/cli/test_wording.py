@@ -2,7 +2,7 @@
 
 import pytest
 
-from lfrtorch.cli.wording import as_words
+from lfrtorch.cli.errors import as_words
 
 
 @pytest.mark.parametrize(
