@@ -141,8 +141,9 @@ def in_groups(command: str, given: Sequence[str]) -> list[str]:
     """The words, with their group before the names that messages have: ``start=estimated``."""
     cfg = chosen(command, [parsed(word) for word in given if "=" in word])
     names = dict(spelt(_with_data(command, cfg)))
+    tables = tuple(f"{name}." for name, node in cfg.items() if node == {})  # take any entry
     return [
-        names.get(name, name) + word[len(name) :]
+        names.get(name, f"++{name}" if name.startswith(tables) else name) + word[len(name) :]
         for word, name in ((word, word.partition("=")[0]) for word in given)
     ]
 

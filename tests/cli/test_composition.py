@@ -189,6 +189,13 @@ def test_a_comma_is_a_list_of_columns_or_of_runs():
     assert in_full("config", ["-m", "x.csv", "inputs=[a],[b]"])[-1] == "data.inputs=[a],[b]"
 
 
+def test_entries_of_a_table_that_is_empty_are_given_by_their_names():
+    words = in_full("config", ["x.csv", "fixed.Cy=[[1,null]]", "fixed.A=[[0.5]]"])
+    cfg = check_words("config", words)
+    assert cfg is not None
+    assert cfg.fixed == {"Cy": [[1, None]], "A": [[0.5]]}
+
+
 def test_paths_that_hydra_would_read_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     names = ["5", "a,b.csv", "a=1.csv", "{x}.csv", "null", "it's.csv", "Maß 1.csv"]
