@@ -16,6 +16,7 @@ _OFTEN = 0.1  # part of the samples: with more gaps than that, the stamps are ro
 _ROUNDED = 1.01  # digits: largest distance of a stamp from the grid if the last digit rounds
 _HOLE = 5.0  # steps without a sample that no line is drawn over
 _SAME = 1e-3  # relative: sampling frequencies that do not contradict one another
+_USUAL = 0.1  # the same where stamps are uneven
 
 
 class Sampling(NamedTuple):
@@ -95,6 +96,11 @@ class EvenTimes(NamedTuple):
     def interpolated(self) -> bool:
         """Tell if samples were changed, apart from missing and omitted ones."""
         return any((np.rint(piece.places) != piece.places).any() for piece in self.pieces)
+
+    @property
+    def tolerance(self) -> float:
+        """How far the rate of the time stamps may be off, relative."""
+        return _USUAL if self.uneven else max(_SAME, self.grid.uncertainty)
 
 
 def even_times(t: Array, fs: float | None = None, *, whole: bool = False) -> EvenTimes:

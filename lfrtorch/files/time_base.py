@@ -15,11 +15,9 @@ from lfrtorch._support.runs import Runs, find_runs, is_run, restarts
 from lfrtorch._support.sampling import EvenTimes, Piece, Sampling, UnevenError, even_times
 from lfrtorch._support.types import Array
 from lfrtorch.files.table import BLOCK, Table
-from lfrtorch.files.time_stamps import is_time, seconds
+from lfrtorch.files.time_stamps import THOUSANDTHS, is_time, seconds
 
 _SAME = 1e-3  # relative: sampling frequencies that do not contradict one another
-_USUAL = 0.1  # the same where stamps are uneven
-_THOUSANDS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
 class TimeBase(NamedTuple):
@@ -62,11 +60,15 @@ class OnGrid(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """A column of time stamps, its grid, and how far its rate may be off."""
+    """A column of time stamps and its grid."""
 
     column: int
-    grid: Sampling
-    tolerance: float
+    even: EvenTimes
+
+    @property
+    def fs(self) -> float:
+        """Its rate in Hz."""
+        return self.even.grid.fs
 
 
 def find_base(
@@ -83,7 +85,7 @@ def find_base(
     named, reasons = _columns(table, used, named=True)
     if fs is not None:
         return _beside(table, named, fs)
-    said = [(_called(table, found.column), found.grid.fs, found.tolerance) for found in named]
+    said = [(_called(table, found.column), found.fs, found.even.tolerance) for found in named]
     said += [(repr(name), rate, _SAME) for name, rate in table.rates.items()]
     for name, rate, tolerance in said[1:]:
         if abs(rate / said[0][1] - 1) > max(tolerance, said[0][2]):
@@ -98,15 +100,15 @@ def find_base(
     found = bool(named)
     if not named and not reasons:
         # A counter of samples is a grid of 1 Hz.
-        named = sorted(_columns(table, used, named=False)[0], key=lambda found: found.grid.fs == 1)
-        if named and named[0].grid.fs == 1:
+        named = sorted(_columns(table, used, named=False)[0], key=lambda found: found.fs == 1)
+        if named and named[0].fs == 1:
             note = f"{_called(table, named[0].column)} is taken for sample numbers"
             return TimeBase(None, named[0].column, (note,), named=False)
     if named:
-        column, grid, _ = named[0]
-        note = f"{_called(table, column)} is taken for {grid}"
+        column, even = named[0]
+        note = f"{_called(table, column)} is taken for {even.grid}"
         columns = tuple(each.column for each in named) if found else ()
-        return TimeBase(grid.fs, column, (note,), named=found, others=columns)
+        return TimeBase(even.grid.fs, column, (note,), named=found, others=columns)
     why = "".join(f"the column {table.headers[c]!r} {error}" for c, error in reasons[:1])
     return TimeBase(None, why=why)
 
@@ -114,11 +116,12 @@ def find_base(
 def _beside(table: Table, named: Sequence[_Found], fs: float) -> TimeBase:
     """The column that runs at a rate that is given, and what contradicts it."""
     notes, agree = [], [found.column for found in named if _agrees(fs, found)]
-    for column, grid, tolerance in named:
-        if abs(fs / grid.fs - 1) > tolerance:
-            unit = _THOUSANDS.get(_thousands(fs / grid.fs), "another unit")
+    for column, even in named:
+        rate = even.grid.fs
+        if abs(fs / rate - 1) > even.tolerance:
+            unit = THOUSANDTHS.get(1 / _thousands(fs / rate), "another unit")
             notes.append(
-                f"fs is {fs:g} Hz and the column {table.headers[column]!r} says {grid.fs:g} Hz; if "
+                f"fs is {fs:g} Hz and the column {table.headers[column]!r} says {rate:g} Hz; if "
                 f"that is right, give time={table.columns[column].name!r} in place of fs"
                 + f", unless it is in {unit}"
                 * (column in agree)
@@ -134,7 +137,7 @@ def _beside(table: Table, named: Sequence[_Found], fs: float) -> TimeBase:
 
 def _agrees(fs: float, found: _Found) -> bool:
     """Tell whether a column runs at a rate, if it is in ms, us or ns, too."""
-    return abs(fs / found.grid.fs / _thousands(fs / found.grid.fs) - 1) <= found.tolerance
+    return abs(fs / found.fs / _thousands(fs / found.fs) - 1) <= found.even.tolerance
 
 
 def _thousands(ratio: float) -> float:
@@ -187,8 +190,8 @@ def _columns(
                 reasons[column] = error
                 continue
             if named or not (again.size or even.uneven or even.grid.gaps.size):
-                tolerance = _USUAL if even.uneven else max(_SAME, even.grid.uncertainty)
-                found[column] = _Found(column, even.grid._replace(unit=unit), tolerance)
+                even = even._replace(grid=even.grid._replace(unit=unit))
+                found[column] = _Found(column, even)
         left = list(found)
     return list(found.values()), sorted(reasons.items())
 
@@ -252,14 +255,14 @@ def _at_times(
     longest = max(own, key=lambda even: sum(len(piece.rows) for piece in even.pieces))
     rate = longest.grid.fs
     for name, even in zip(runs.names, own, strict=True):
-        off = abs(even.grid.fs / rate - 1) > max(_tolerance(even), _tolerance(longest))
+        off = abs(even.grid.fs / rate - 1) > max(even.tolerance, longest.tolerance)
         if off and not table.asked:
             raise InputError(
                 f"'{table.path}': run {name} is sampled at {even.grid.fs:g} Hz and the longest at "
                 f"{rate:g} Hz; '{table.path.name}#{rate:.6g}Hz' puts all on one grid."
             )
     factor = 1.0 if fs is None or base.given else _thousands(fs / rate)
-    if fs is not None and base.given and abs(fs / rate - 1) > _tolerance(longest):
+    if fs is not None and base.given and abs(fs / rate - 1) > longest.tolerance:
         raise InputError(
             f"fs is {fs:g} Hz and the time column {_header(table, base)} of '{table.path}' says "
             f"{rate:g} Hz; leave fs or time out, whichever is wrong."
@@ -269,7 +272,13 @@ def _at_times(
     rate = table.asked / factor if table.asked else rate
     found = [_even(times, part, rate, whole=whole) for part in parts]
     pieces = [piece for even in found for piece in even.pieces]
-    notes = _changed(table, base, found, rate * factor)
+    uneven = next((even.uneven for even in found if even.uneven), None)
+    why = "" if uneven is None else f"the time {_uneven(table, base, uneven)}: "
+    notes = list[str]()
+    if any(even.interpolated for even in found):
+        notes.append(f"{why}signals are interpolated to even times of {rate * factor:g} Hz")
+    elif why:
+        notes.append(f"{why}samples that are off the even grid are left out")
     for piece in pieces:
         missing = piece.missing()
         if missing.any():
@@ -284,15 +293,6 @@ def _at_times(
     return OnGrid(rate * factor, runs, [even.pieces for even in found], notes)
 
 
-def _changed(table: Table, base: TimeBase, found: Sequence[EvenTimes], fs: float) -> list[str]:
-    """How samples came to be on an even grid."""
-    uneven = next((even.uneven for even in found if even.uneven), None)
-    why = "" if uneven is None else f"the time {_uneven(table, base, uneven)}: "
-    if any(even.interpolated for even in found):
-        return [f"{why}signals are interpolated to even times of {fs:g} Hz"]
-    return [f"{why}samples that are off the even grid are left out"] if why else []
-
-
 def _even(times: Array, part: slice, fs: float | None, *, whole: bool) -> EvenTimes:
     """The places of a run's samples, rows and reasons counted from the first of the file."""
     try:
@@ -304,11 +304,6 @@ def _even(times: Array, part: slice, fs: float | None, *, whole: bool) -> EvenTi
         even.uneven.sample += part.start
     pieces = [piece._replace(rows=piece.rows + part.start) for piece in even.pieces]
     return even._replace(pieces=pieces)
-
-
-def _tolerance(even: EvenTimes) -> float:
-    """How far the rate of time stamps may be off."""
-    return _USUAL if even.uneven else max(_SAME, even.grid.uncertainty)
 
 
 def _uneven(table: Table, base: TimeBase, error: UnevenError) -> str:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lfrtorch._support.sampling import Sampling, UnevenError, sampling
+from lfrtorch._support.sampling import UnevenError
 from lfrtorch._support.types import Array
 from lfrtorch.data.records import Channel
 
@@ -16,21 +16,24 @@ _NAMES = re.compile(
     re.IGNORECASE,
 )
 _SUFFIX = re.compile(r"(.+)[ _.-]([a-zµμ]+)", re.IGNORECASE)  # a unit behind a name, as in time_ms
-_SECONDS = {
-    unit: seconds
-    for seconds, units in (
-        (1e-9, "ns nsec nanosecond nanosekunde"),
-        (1e-6, "us µs μs usec µsec μsec microsecond mikrosekunde"),
-        (1e-3, "ms msec millisecond millisekunde"),
-        (1.0, "s sec second sek sekunde"),
-        (60.0, "min minute"),
-        (3600.0, "h hr hour std stunde"),
-        (86400.0, "d day tag tage"),
-        (1e3, "ks kilosecond"),
-    )
-    for unit in units.split()
-}
+_UNITS = (
+    (1e-9, "nanoseconds", "ns nsec nanosecond nanosekunde"),
+    (1e-6, "microseconds", "us µs μs usec µsec μsec microsecond mikrosekunde"),
+    (1e-3, "milliseconds", "ms msec millisecond millisekunde"),
+    (1.0, "seconds", "s sec second sek sekunde"),
+    (60.0, "minutes", "min minute"),
+    (3600.0, "hours", "h hr hour std stunde"),
+    (86400.0, "days", "d day tag tage"),
+    (1e3, "kiloseconds", "ks kilosecond"),
+)
+"""Units of time: seconds, name, and spellings without an ending."""
+
+_SECONDS = {spelling: one for one, _, spellings in _UNITS for spelling in spellings.split()}
 _KNOWN = "s, ms, us, ns, min, h or d"
+
+THOUSANDTHS = {one: name for one, name, _ in _UNITS[2::-1]}
+"""Units that stamps count in without saying it, by their seconds."""
+
 _SINCE_1970 = (1e9, 4e9)  # seconds: the years 2001 to 2096
 
 
@@ -58,7 +61,7 @@ def time_unit(t: Array, channel: Channel) -> TimeUnit:
         return TimeUnit(seconds)
     known = t[np.isfinite(t)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
-    for seconds, name in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
+    for seconds, name in THOUSANDTHS.items():
         if _SINCE_1970[0] <= seconds * low and seconds * high <= _SINCE_1970[1]:
             return TimeUnit(seconds, f"{name} since 1970")
     remedy = f"write the unit behind the name, {_KNOWN} in brackets"
@@ -95,12 +98,6 @@ def seconds(t: Array, channel: Channel) -> tuple[Array, str]:
     filled[: known[0]] -= step * np.arange(known[0], 0, -1)
     filled[known[-1] + 1 :] += step * np.arange(1, T - known[-1])
     return filled * unit.seconds, unit.assumed
-
-
-def column_sampling(t: Array, channel: Channel) -> Sampling:
-    """The grid of a column of time stamps (T,), NaN where one is missing; see :func:`sampling`."""
-    times, unit = seconds(t, channel)
-    return sampling(times)._replace(unit=unit)
 
 
 def _named(channel: Channel) -> tuple[str, str]:

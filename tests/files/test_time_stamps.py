@@ -3,17 +3,22 @@
 import numpy as np
 import pytest
 
-from lfrtorch._support.sampling import UnevenError, sampling
+from lfrtorch._support.sampling import Sampling, UnevenError, sampling
 from lfrtorch.data.records import Channel
-from lfrtorch.files.time_stamps import column_sampling, is_time, time_unit
+from lfrtorch.files.time_stamps import is_time, seconds, time_unit
 
 pytestmark = pytest.mark.numeric
 
 T = np.arange(400) / 100
 
 
+def column_sampling(t, channel: Channel) -> Sampling:
+    times, unit = seconds(t, channel)
+    return sampling(times)._replace(unit=unit)
+
+
 @pytest.mark.parametrize(
-    ("units", "seconds"),
+    ("units", "each"),
     [
         ("ns nsec nanoseconds", 1e-9),
         ("us µs μs usec microseconds", 1e-6),
@@ -25,12 +30,12 @@ T = np.arange(400) / 100
         ("ks", 1e3),
     ],
 )
-def test_units_of_time_and_their_spellings(units, seconds):
+def test_units_of_time_and_their_spellings(units, each):
     for unit in units.split():
-        found = column_sampling(T / seconds, Channel("time", unit))
+        found = column_sampling(T / each, Channel("time", unit))
         assert found.fs == pytest.approx(100.0, rel=max(1e-9, found.uncertainty)), unit
     since = Channel("time", f"{units.split()[0]} since 2024-01-01")
-    assert time_unit(T, since).seconds == seconds
+    assert time_unit(T, since).seconds == each
 
 
 @pytest.mark.parametrize("unit", ["Ms", "MS", "m", "V", "samples", "-", "UTC"])
