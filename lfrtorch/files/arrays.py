@@ -10,7 +10,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -311,19 +311,6 @@ def _variable(name: str, value: Any, found: dict[str, Signal | str]) -> None:
         found[name] = _signal(value)
 
 
-class _HDF5(AbstractContextManager):
-    """Datasets of an open HDF5 file, by path or by dotted name."""
-
-    def __init__(self, path: Path, names: Mapping[str, str]) -> None:
-        self._file, self._names = optional("h5py").File(path), names
-
-    def __getitem__(self, name: str) -> Any:
-        return self._file[self._names[name]]
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-
 def hdf5(path: Path, *, matlab: bool = False) -> ArrayTable:
     """The datasets of an HDF5 file by their paths, or of one by MATLAB by dotted names."""
     h5py = optional("h5py")
@@ -334,7 +321,13 @@ def hdf5(path: Path, *, matlab: bool = False) -> ArrayTable:
             _group(file, "", matlab, found, names)
     except (OSError, RuntimeError, LookupError, TypeError, ValueError) as error:
         raise _damaged(path, error) from error
-    return ArrayTable(path, found, lambda path: _HDF5(path, names))
+
+    @contextmanager
+    def stored(path: Path) -> Iterator[Any]:
+        with h5py.File(path) as file:
+            yield {name: file[place] for name, place in names.items()}
+
+    return ArrayTable(path, found, stored)
 
 
 def _group(
