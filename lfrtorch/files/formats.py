@@ -10,8 +10,8 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import expanded
 from lfrtorch.files import arrays as array_table
 from lfrtorch.files.excel import EXTENSIONS, ExcelTable, workbook
+from lfrtorch.files.frame import parquet
 from lfrtorch.files.loggers import READERS
-from lfrtorch.files.parquet import ParquetTable
 from lfrtorch.files.table import BLOCK, Table, rate_behind
 from lfrtorch.files.text import TextTable
 
@@ -23,7 +23,7 @@ FORMATS: dict[str, Callable[[Path], Table]] = {
     ".npz": array_table.npz,
     ".npy": array_table.npy,
     **dict.fromkeys((".h5", ".hdf5"), array_table.hdf5),
-    ".parquet": ParquetTable,
+    ".parquet": parquet,
     **dict.fromkeys(EXTENSIONS, ExcelTable),
     **READERS,
 }

@@ -1,54 +1,107 @@
-"""A data frame of pandas as a table."""
+"""Frames of pandas as a table: one in memory, or those of a Parquet file one after another."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.frames import columns_of, index_times, is_frame
 from lfrtorch._support.types import Array
-from lfrtorch.files.table import BLOCK, Table
+from lfrtorch.files.arrays import optional
+from lfrtorch.files.table import BLOCK, Clock, Table
+
+Frames = Callable[[list[int], int], Iterator[Any]]
+"""Returns frames of some columns, by their numbers, with at most so many rows."""
 
 
 class FrameTable(Table):
-    """The columns of a frame, and its index as the first one if that is a time."""
+    """Columns of numbers and of date-times."""
 
-    def __init__(self, frame: Any, name: str) -> None:
-        self._frame, self._times = frame, index_times(frame)
-        timed = self._times is not None
-        index = f"{frame.index.name or 'time'}"
-        headers = [index] * timed + [str(column) for column in frame.columns]
-        super().__init__(Path(name), headers, clocks={0} if timed else ())
+    def __init__(self, path: Path, headers: Sequence[str], frames: Frames, **found: Any) -> None:
+        super().__init__(path, headers, **found)
+        self._frames = frames
 
     def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
         """See :meth:`Table.blocks`."""
-        times = self._times
-        timed = times is not None
-        for first in range(0, len(self._frame), samples):
-            part = self._frame.iloc[first : first + samples]
-            block = np.empty((len(part), len(columns)))
-            for place, column in enumerate(columns):
-                if times is not None and column == 0:
-                    block[:, place] = times[first : first + samples]
-                else:
-                    block[:, place] = columns_of(part, [column - timed])[:, 0]
-            yield block
+        clocks = [Clock() for _ in columns]
+        for part in self._frames([*columns], samples):
+            found = np.empty((len(part), len(columns)))
+            for i, clock in enumerate(clocks):
+                dated = part.dtypes.iloc[i].kind == "M"
+                dates = part.iloc[:, i].to_numpy("M8[ns]") if dated else None
+                found[:, i] = columns_of(part, [i])[:, 0] if dates is None else clock(dates)
+            yield found
 
     def labels(self, column: int) -> NDArray[Any]:
         """See :meth:`Table.labels`."""
-        place = column - (self._times is not None)
         found = super().labels(column)
-        return found if len(found) else self._frame.iloc[:, place].astype(str).to_numpy(str)
+        if len(found):
+            return found
+        words = [part.iloc[:, 0].astype(str) for part in self._frames([column], BLOCK)]
+        return np.concatenate(words) if words else found
 
 
 def frame_tables(given: Any) -> list[FrameTable]:
     """The tables of a frame, or of a list of them; none of anything else."""
     if is_frame(given):
-        return [FrameTable(given, "frame")]
+        return [_in_memory(given, "frame")]
     if isinstance(given, list | tuple) and given and all(map(is_frame, given)):
-        return [FrameTable(frame, f"frame{i}") for i, frame in enumerate(given, 1)]
+        return [_in_memory(frame, f"frame{i}") for i, frame in enumerate(given, 1)]
     return []
+
+
+def _in_memory(frame: Any, name: str) -> FrameTable:
+    """A frame, with its index as the first column if that is a time."""
+    times, index = index_times(frame), f"{frame.index.name or 'time'}"
+    if times is not None:
+        frame = frame.copy(deep=False)
+        frame.insert(0, index, times, allow_duplicates=True)
+
+    def frames(columns: list[int], samples: int) -> Iterator[Any]:
+        for first in range(0, len(frame), samples):
+            yield frame.iloc[first : first + samples, columns]
+
+    clocks = () if times is None else {0}
+    return FrameTable(Path(name), [*map(str, frame.columns)], frames, clocks=clocks)
+
+
+def parquet(path: Path) -> FrameTable:
+    """The columns of a Parquet file, by batches of row groups; nulls are missing values."""
+    pa, pq = optional("pyarrow"), optional("pyarrow.parquet")
+
+    def damaged(error: Exception) -> InputError:
+        said = brief(error)
+        return InputError(f"'{path}' is not a readable Parquet file ({said}); write it again.")
+
+    try:
+        schema = pq.read_schema(path)
+    except (pa.ArrowException, OSError) as error:
+        raise damaged(error) from error
+    kinds = pa.types
+    dated = kinds.is_timestamp
+    usable = kinds.is_integer, kinds.is_floating, kinds.is_boolean, kinds.is_decimal, dated
+    fields = [f for f in schema if any(check(f.type) for check in usable)]
+    headers = [f.name for f in fields]
+
+    def frames(columns: list[int], samples: int) -> Iterator[Any]:
+        names = [headers[column] for column in columns]
+        try:
+            # Read ahead, the whole file would come to be in memory.
+            with pq.ParquetFile(path, pre_buffer=False) as file:
+                for batch in file.iter_batches(samples, columns=list(dict.fromkeys(names))):
+                    yield batch.to_pandas(ignore_metadata=True)[names]
+        except (pa.ArrowException, OSError) as error:
+            raise damaged(error) from error
+
+    refused = {
+        f.name: f"has no numbers (its type is {f.type}); store it as numbers"
+        for f in schema
+        if f.name not in headers
+    }
+    clocks = {i for i, f in enumerate(fields) if dated(f.type)}
+    return FrameTable(path, headers, frames, refused=refused, clocks=clocks)
