@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.headers import bracketed, is_unit
-from lfrtorch._support.types import Array
-from lfrtorch.files.table import BLOCK, LEAST, Clock, Table
+from lfrtorch.files.frame import FrameTable
+from lfrtorch.files.table import LEAST, Table
 
 _HEAD = 1 << 18  # characters that tell the layout
 _LONGEST = 1 << 25  # characters of a line
@@ -74,7 +74,7 @@ class Layout:
     times: frozenset[int] = frozenset()  # columns of times of day, which are in seconds
 
 
-class TextTable(Table):
+class TextTable(FrameTable):
     """A text file (.csv, .tsv, .txt, .dat, .lvm, also as .gz), read by pandas in blocks.
 
     The delimiter is a tab, ";", ",", "|" or blanks, whichever makes the most cells numbers; the
@@ -86,18 +86,16 @@ class TextTable(Table):
     def __init__(self, path: Path, layout: Layout | None = None) -> None:
         self.layout = layout = layout or _layout(path)
         clocks = layout.dates | layout.times
-        super().__init__(
-            path, layout.headers, units=layout.units, rates=layout.rates, clocks=clocks
-        )
+        told = {"units": layout.units, "rates": layout.rates, "clocks": clocks}
+        super().__init__(path, layout.headers, self._parsed, **told)
         self.notes = layout.notes
 
-    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
-        """See :meth:`Table.blocks`; a line's missing cells are missing values."""
+    def _parsed(self, columns: Sequence[int], samples: int) -> Iterator[Any]:
+        """Frames of some columns; a line's missing cells are missing values."""
         import pandas as pd  # slow to import
 
         layout, beyond = self.layout, len(self.columns)
         dates = layout.dates.intersection(columns)
-        clocks = {column: Clock() for column in dates}
         # A line of one more missing value than there are columns, which is no sample, comes first:
         # pandas takes the number of columns from there.
         first = layout.delimiter.join(["nan"] * (beyond + 1)) + "\n"
@@ -125,10 +123,9 @@ class TextTable(Table):
                     )[1:]
                 if part[beyond].notna().any():
                     self._explain(columns)
-                found = np.empty((len(part), len(columns)))
-                for i, column in enumerate(columns):
-                    values = part[column]
-                    found[:, i] = clocks[column](_times(values)) if column in dates else values
+                found = part[[*columns]].copy()
+                for column in dates:
+                    found[column] = _times(part[column])
                 yield found
         except InputError:
             raise
@@ -141,7 +138,7 @@ class TextTable(Table):
 
     def labels(self, column: int) -> NDArray[Any]:
         """See :meth:`Table.labels`."""
-        found = super().labels(column)
+        found = Table.labels(self, column)
         if len(found):
             return found
         cells = (line.cells for line in self._lines())
