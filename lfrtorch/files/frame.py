@@ -66,7 +66,8 @@ def _in_memory(frame: Any, name: str) -> FrameTable:
         for first in range(0, len(frame), samples):
             yield frame.iloc[first : first + samples, columns]
 
-    clocks = () if times is None else {0}
+    clocks = {i for i, kind in enumerate(frame.dtypes) if kind.kind == "M"}
+    clocks |= {0} if times is not None else set()
     return FrameTable(Path(name), [*map(str, frame.columns)], frames, clocks=clocks)
 
 

@@ -42,6 +42,15 @@ def test_the_index_tells_the_rate(index: pd.Index):
     assert (loaded.name, len(loaded.tests)) == ("frame", 1)
 
 
+@pytest.mark.parametrize("zone", [None, "Europe/Berlin"])
+def test_a_column_of_date_times_tells_the_rate(zone: str | None):
+    """Date-times were read as nanoseconds since 1970."""
+    given = frame().assign(when=STAMPS.tz_localize(zone))
+    loaded = lfrtorch.load_records(given, inputs="force", outputs="disp", start="zero")
+    assert loaded.train[0].fs == pytest.approx(FS)
+    assert loaded.notes == ("the column 'when' is taken for the time, 50 Hz",)
+
+
 def test_rows_that_only_count_need_a_rate():
     with pytest.raises(InputError, match="index is no time; give fs=HZ"):
         Record.from_frame(frame(), "force", "disp")
