@@ -16,10 +16,8 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import black_tophat, maximum_filter1d, white_tophat
 
 from lfrtorch._support.types import Array, Integers
 
@@ -79,7 +77,8 @@ def _sticking_out(x: Array) -> Integers:
     values = np.unique(x) if T >= _SHORTEST else x[:0]
     if len(values) <= _LEVELS:
         return np.zeros(0, np.int64)
-    height = _heights(x)
+    tophats = (tophat(x, 3, mode="mirror") for tophat in (white_tophat, black_tophat))
+    height = np.maximum(*tophats)
     found = height > max(_limit(height), _STEPS * float(np.diff(values).min()))
     if not 0 < np.count_nonzero(found) <= max(_FEW, _MOST * T):
         return np.zeros(0, np.int64)
@@ -94,18 +93,6 @@ def _sticking_out(x: Array) -> Integers:
     between = np.zeros(T, bool)  # a good sample between two bad ones sticks out on their other side
     between[1:-1] = found[:-2] & found[2:] & (outside[1:-1] <= 0)
     return np.flatnonzero(found & ~between)
-
-
-def _heights(x: Array) -> Array:
-    """What opening and closing by three samples take off, the larger one: (T,)."""
-
-    def three(of: Callable[[Array, Array], Array], x: Array) -> Array:
-        return of(of(x[:-2], x[1:-1]), x[2:])
-
-    around = np.pad(x, 2, mode="reflect")
-    opened = three(np.maximum, three(np.minimum, around))
-    closed = three(np.minimum, three(np.maximum, around))
-    return np.maximum(x - opened, closed - x)
 
 
 def _limit(height: Array) -> float:
