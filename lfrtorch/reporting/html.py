@@ -83,16 +83,18 @@ def render(
         data=_data(run.evaluation),
         records=[{"name": name, "views": list(own.items())} for name, own in (views or {}).items()],
         residuals_legend=RESIDUALS_LEGEND,
-        linear=_linear(run),
+        linear=run.linear,
+        poles=_poles(run),
         known=([], []) if run.parameters is None else run.parameters.rows(),
-        fit=_fit(run),
+        fit=run.fit,
+        starts=starts(run.fit, run.settings.seeds, common_unit(run.model.outputs)),
         search=(len(tried), choice_table(tried), LEGEND.splitlines()),
         parameters=[
             [name, " × ".join(map(str, w.shape)), w.numel()] for name, w in groups if w.numel()
         ],
         stability=stability(run.metrics["stable_to"]),
         memory="" if run.memory is None else str(run.memory),
-        facts=_facts(run),
+        machine=_machine(run),
     )
 
 
@@ -105,7 +107,7 @@ def page(template: str, images: Mapping[str, bytes], **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["cell"] = cell
+    environment.filters |= {"cell": cell, "number": number, "count": _count}
     inside = {
         name: f"data:image/png;base64,{base64.b64encode(png).decode()}"
         for name, png in images.items()
@@ -217,68 +219,26 @@ def _moments(x: Array) -> list[float]:
     return [mean, deviation, float(np.min(x)), float(np.max(x))]
 
 
-def _linear(run: Run) -> dict[str, Any]:
-    bla, result = run.linear, run.fit
-    summary, notes = f"Order {bla.nx}.", ()
-    if bla.fit is not None:
-        notes = bla.fit.notes
-        summary = (
-            f"Order {bla.nx}, {bla.fit.criterion} error {number(bla.fit.rmse)} (normalised), "
-            f"{_count(bla.fit.iterations, 'iteration')}, {bla.fit.reason}."
-        )
-    if run.order_scan is not None:
-        scanned = bla.nx == run.order_scan.chosen
-        chooser = "scan over orders" if scanned else "cross-validation of the sizes"
-        summary += f" The {chooser} chose the order."
-        if run.settings.nx != bla.nx:
-            summary += f" The NL-LFR begins with order {run.settings.nx}, as its sizes were chosen."
-    caption = "Frequency response of the model, over the measured one if the records give one"
-    if bla.covariance is not None:
-        caption += "; band: ± 2 standard deviations"
-    poles: list[Sequence[Cell]] = []
-    for model, values in (("linear", bla.poles), ("NL-LFR", poles_at_rest(result.model))):
-        poles += [
-            [
-                model,
-                *(number(p[key], 4) for key in ("frequency", "damping")),
-                radius(p["radius"]),
-                remark(p, pole=True),
-            ]
-            for p in frequency_and_damping(values, bla.fs)
-        ]
-    return {"summary": summary, "notes": notes, "caption": f"{caption}.", "poles": poles}
-
-
-def _fit(run: Run) -> dict[str, Any]:
-    fit, count = run.fit, len(run.fit.starts)
-    unit, head, rows, others = starts(fit, run.settings.seeds, common_unit(run.model.outputs))
-    judge = "validation" if run.dataset.validation else "training"
-    said = [
-        f"{fit.outcome.capitalize()}; kept iteration {fit.chosen_iteration} of "
-        f"{fit.iterations}, the best on {judge}.",
-        *[f"The best of {count} starts."] * (count > 1),
-        *run.origins,
-    ]
-    return {"summary": " ".join(said), "unit": unit, "head": head, "starts": rows, "others": others}
-
-
-def _facts(run: Run) -> list[list[str]]:
-    fit, found = run.fit, run.linear.fit
-    weight = run.fit.model.lfr.cell.A
-    facts = [
-        ["time of the fit", f"{number(fit.seconds)} s"],
-        ["an iteration", f"{number(1e3 * fit.seconds_per_iteration)} ms"],
-    ]
-    if found is not None:
-        facts.append(["time of the linear model", f"{number(found.seconds)} s"])
+def _poles(run: Run) -> list[Sequence[Cell]]:
+    """Rows of the table of poles, those of the NL-LFR at rest."""
+    of = ("linear", run.linear.poles), ("NL-LFR", poles_at_rest(run.fit.model))
     return [
-        *facts,
-        ["machine", f"{platform.machine()}, {_count(os.cpu_count() or 1, 'CPU')}"],
-        ["threads, device, dtype", f"{torch.get_num_threads()}, {weight.device}, "
-         f"{str(weight.dtype).removeprefix('torch.')}"],
-        ["platform", platform.platform()],
-        *([name, known] for name, known in run.metrics["versions"].items()),
+        [model, number(p["frequency"], 4), number(p["damping"], 4), radius(p["radius"]),
+         remark(p, pole=True)]
+        for model, values in of
+        for p in frequency_and_damping(values, run.linear.fs)
     ]  # fmt: skip
+
+
+def _machine(run: Run) -> list[Sequence[Cell]]:
+    weight = run.fit.model.lfr.cell.A
+    dtype = str(weight.dtype).removeprefix("torch.")
+    return [
+        ["machine", f"{platform.machine()}, {_count(os.cpu_count() or 1, 'CPU')}"],
+        ["threads, device, dtype", f"{torch.get_num_threads()}, {weight.device}, {dtype}"],
+        ["platform", platform.platform()],
+        *run.metrics["versions"].items(),
+    ]
 
 
 def _count(n: int, what: str) -> str:
