@@ -75,25 +75,19 @@ def render(
         config=config,
         date=datetime.now().strftime("%d %B %Y, %H:%M"),
         sizes=in_words(run.model.sizes, run.model.known_states, run.fit.averaged),
-        numbers=", ".join(f"{name} {value}" for name, value in run.metrics["used"].items()),
         comparisons=comparisons(run.evaluation),
         linear_is_used=run.verdict.use == LINEAR_MODEL,
-        used="RUN/linear" if run.verdict.use == LINEAR_MODEL else "RUN",
         scores=_scores(run.evaluation),
         data=_data(run.evaluation),
         records=[{"name": name, "views": list(own.items())} for name, own in (views or {}).items()],
         residuals_legend=RESIDUALS_LEGEND,
         linear=run.linear,
         poles=_poles(run),
-        known=([], []) if run.parameters is None else run.parameters.rows(),
         fit=run.fit,
         starts=starts(run.fit, run.settings.seeds, common_unit(run.model.outputs)),
         search=(len(tried), choice_table(tried), LEGEND.splitlines()),
-        parameters=[
-            [name, " × ".join(map(str, w.shape)), w.numel()] for name, w in groups if w.numel()
-        ],
+        parameters=[[name, " × ".join(map(str, w.shape)), w.numel()] for name, w in groups],
         stability=stability(run.metrics["stable_to"]),
-        memory="" if run.memory is None else str(run.memory),
         machine=_machine(run),
     )
 

@@ -16,9 +16,8 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
 from lfrtorch.reporting import figures as run_figures
 from lfrtorch.reporting import linear_plots
-from lfrtorch.reporting.evaluation import Evaluation, Response
+from lfrtorch.reporting.evaluation import Evaluation, Response, finite
 from lfrtorch.reporting.score_columns import ALL, columns, in_units, rows_of
-from lfrtorch.reporting.scores import finite
 from lfrtorch.reporting.verdict import judge_linear
 
 
@@ -91,21 +90,21 @@ def _model(evaluation: Evaluation) -> LinearModel:
 
 def _score(response: Response) -> dict[str, Any]:
     """Simulation errors of each output after the skip window."""
-    score = response.score
-    errors = zip(score.channels, score.lti_rmse_by_output, score.std_by_output, strict=True)
+    name, score = response.record.name, response.score
     return {
         "use": response.use,
-        "record": response.record.name,
-        **{name: getattr(score, name) for name in ("source", "samples", "skip", "scored")},
+        "record": name,
+        **{of: getattr(score, of) for of in ("source", "samples", "skip", "scored")},
         "outputs": [
             {
-                "output": channel.name,
-                "unit": channel.unit,
-                "rmse": rmse,
-                "std": std,
-                "nrmse": rmse / std if std > 0 else None,
+                "output": row.output,
+                "unit": row.unit,
+                "rmse": row.linear,
+                "std": row.std,
+                "nrmse": row.relative(row.linear),
             }
-            for channel, rmse, std in errors
+            for row in rows_of(name, score)
+            if row.output != ALL
         ],
     }
 
@@ -115,18 +114,17 @@ def _uncertainty(model: LinearModel, frf: FRF | None) -> list[dict[str, Any]]:
     f = linear_plots.frequencies(model, frf)
     std, size = model.frf_std(f), np.abs(model.frf(f))
     listed = []
-    for i, output in enumerate(model.outputs):
-        for j, source in enumerate(model.inputs):
-            k = int(np.argmax(std[:, i, j]))
-            largest, there = float(std[k, i, j]), float(size[k, i, j])
-            listed.append(
-                {
-                    "channel": f"{output.name}/{source.name}",
-                    "std": largest,
-                    "frequency": float(f[k]),
-                    "relative": largest / there if there > 0 else None,
-                }
-            )
+    for i, j in np.ndindex(*std.shape[1:]):
+        k = int(np.argmax(std[:, i, j]))
+        largest, there = float(std[k, i, j]), float(size[k, i, j])
+        listed.append(
+            {
+                "channel": f"{model.outputs[i].name}/{model.inputs[j].name}",
+                "std": largest,
+                "frequency": float(f[k]),
+                "relative": largest / there if there > 0 else None,
+            }
+        )
     return listed
 
 
