@@ -282,6 +282,7 @@ _OF_DATA = {
         "output's standard deviation",
     ),
 }
+"""Rules on the records and their noise."""
 
 _OF_MODEL = {
     "overfits": Rule(
@@ -410,6 +411,7 @@ _OF_MODEL = {
         "their ridge was chosen with",
     ),
 }
+"""Rules on the sizes and the search."""
 
 _OF_USE = {
     "tests_are_louder": Rule(
@@ -418,6 +420,7 @@ _OF_USE = {
         _louder,
     ),
 }
+"""Rules on the inputs that the model is for."""
 
 _LAST = {
     "noise_unknown": Rule(
@@ -428,9 +431,10 @@ _LAST = {
         "training records",
     ),
 }
+"""The rule that speaks if no other does."""
 
 RULES = _OF_DATA | _OF_MODEL | _OF_USE | _LAST
-"""The rules by name, the most useful first; the last one speaks if no other does."""
+"""All rules by name, the most useful first."""
 
 
 def _words(change: Mapping[str, Any], write: Callable[[Any], str] = str) -> list[str]:

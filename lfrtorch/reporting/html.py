@@ -53,6 +53,14 @@ from lfrtorch.reporting.verdict import LINEAR_MODEL, of_linear
 
 _FEW = 3  # most tests that the verdict names one by one
 
+_PAGES = jinja2.Environment(
+    loader=jinja2.PackageLoader("lfrtorch.reporting"),
+    autoescape=True,
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+
 
 def render(
     run: Run,
@@ -65,9 +73,8 @@ def render(
     """Make the page of a run; images are PNG by name, views captions by record and name."""
     tried = run.metrics["sizes_search"]
     groups = [(name, w) for name, w in run.fit.model.lfr.cell.named_parameters() if w.numel()]
-    return page(
-        "report.html",
-        images,
+    return _PAGES.get_template("report.html").render(
+        images={name: _address(png) for name, png in images.items()},
         run=run,
         metrics=run.metrics,
         command=command or UNKNOWN,
@@ -92,21 +99,9 @@ def render(
     )
 
 
-def page(template: str, images: Mapping[str, bytes], **values: Any) -> str:
-    """Fill a template of ours, with images (PNG by name) inside."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("lfrtorch.reporting"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"cell": cell, "number": number, "count": _count}
-    inside = {
-        name: f"data:image/png;base64,{base64.b64encode(png).decode()}"
-        for name, png in images.items()
-    }
-    return environment.get_template(template).render(images=inside, **values)
+def _address(png: bytes) -> str:
+    """An image inside the page."""
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
 def comparisons(evaluation: Evaluation) -> list[str]:
@@ -237,3 +232,6 @@ def _machine(run: Run) -> list[Sequence[Cell]]:
 
 def _count(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
+
+
+_PAGES.filters |= {"cell": cell, "number": number, "count": _count}

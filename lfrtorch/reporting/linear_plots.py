@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from lfrtorch._support.drawing import (
+    CHANNELS,
     decibel,
     frequency_axis,
     is_wide,
@@ -21,9 +22,9 @@ from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
 
-MEASURED, MODEL, DIFFERENCE = "#0072b2", "black", "#e69f00"
-TOTAL, NOISE, ODD, EVEN = "#d55e00", "0.5", "#d55e00", "#cc79a7"
-"""Of Okabe and Ito's palette, which colour-blind readers tell apart."""
+MEASURED, TOTAL, _, EVEN, DIFFERENCE, _ = CHANNELS
+MODEL, NOISE, ODD = "black", "0.5", TOTAL
+"""Colours of what is drawn."""
 
 _GRID = 500  # frequencies at which a model is drawn, beside those of its poles
 _LOWEST = 1e-3  # first frequency of a model drawn alone, relative to half the sampling frequency

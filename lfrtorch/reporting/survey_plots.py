@@ -7,13 +7,11 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lfrtorch._support.drawing import unit_axis
+from lfrtorch._support.drawing import CHANNELS, OUTPUT, unit_axis
 from lfrtorch._support.types import Array
 from lfrtorch.reporting.plots import envelope
 from lfrtorch.survey.measurement import Survey
 from lfrtorch.survey.signal import LEAST, SignalSurvey, longest_run
-
-OUTPUT = "0.15"
 
 
 def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
@@ -24,10 +22,10 @@ def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
     fs = 1.0 if found.fs is None else found.fs
     t = np.arange(len(signals)) / fs
     for one, signal, (time, values, lines) in zip(found.signals, signals.T, grid, strict=True):
-        colour = "#0072b2" if one in found.inputs else OUTPUT
+        colour = CHANNELS[0] if one in found.inputs else OUTPUT
         time.plot(*envelope(t, signal), lw=0.6, color=colour)
         for end in one.clipped:
-            time.axhline(end.value, lw=1.0, ls="--", color="#d55e00")
+            time.axhline(end.value, lw=1.0, ls="--", color=CHANNELS[1])
         time.set_xlim(0, max(t[-1], 1 / fs))
         unit_axis(time.yaxis, time.get_ylim(), one.channel.name, one.channel.unit)
         known = signal[np.isfinite(signal)]
