@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any, Literal
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import ArrayLike, NDArray
 
@@ -26,6 +29,19 @@ CHANNELS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Colours of several channels."""
 
 _LOG_DECADES = 1.5  # width of a band from which on the frequency axis is logarithmic
+
+
+def panels(
+    size: tuple[float, float],
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    layout: Literal["constrained", "compressed"] = "constrained",
+    **of: Any,
+) -> tuple[Figure, NDArray[np.object_]]:
+    """A figure of a size in inches, and its axes by row and column; ``of`` is for the grid."""
+    figure = Figure(figsize=size, layout=layout)
+    return figure, figure.subplots(rows, columns, squeeze=False, **of)
 
 
 def unit_axis(axis: Axis, limits: tuple[float, float], name: str, unit: str) -> None:

@@ -24,7 +24,7 @@ from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.cli.run_folder import CONFIG, no_empty_folder, program
 from lfrtorch.fitting.linear_start import linear_model, linear_records
 from lfrtorch.linear.requirements import of_response
-from lfrtorch.reporting import linear_report
+from lfrtorch.reporting import linear_report, plots
 from lfrtorch.reporting.console import Console
 from lfrtorch.reporting.evaluation import Evaluation
 
@@ -60,9 +60,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
         fresh.write_text(text + "\n")
     with whole_file(folder / CONFIG) as fresh:
         OmegaConf.save(cfg, fresh, resolve=True)
-    for name, figure in linear_report.figures(evaluation, frf, scan).items():
-        with whole_file(folder / "figures" / f"{name}.png") as fresh:
-            figure.savefig(fresh, dpi=150)
+    plots.save(linear_report.figures(evaluation, frf, scan), folder / "figures")
     print(f"\nRun in {folder}")
 
 

@@ -12,6 +12,7 @@ from lfrtorch._support.drawing import (
     decibel,
     frequency_axis,
     is_wide,
+    panels,
     plain_ticks,
     reference,
     unit_label,
@@ -46,10 +47,9 @@ _FAR = 2.0  # half width of the z plane that is drawn: sampling puts zeros far o
 def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
     """Draw magnitude and phase of the model ± 2 std, over the measured response if given."""
     ny, nu = len(model.outputs), len(model.inputs)
-    figure = Figure(figsize=(2.5 + 5.5 * nu, 5.5 * ny), layout="constrained")
-    grid = figure.subplots(
-        2 * ny, nu, squeeze=False, sharex=True, height_ratios=[3, 1.5] * ny
-    )  # a row of magnitudes and a row of phases for each output
+    # A row of magnitudes and a row of phases for each output.
+    size, heights = (2.5 + 5.5 * nu, 5.5 * ny), [3, 1.5] * ny
+    figure, grid = panels(size, 2 * ny, nu, sharex=True, height_ratios=heights)
     smooth = frequencies(model, frf)
     f = smooth if frf is None else np.union1d(smooth, frf.frequencies)
     lines = None if frf is None else np.searchsorted(f, frf.frequencies)
@@ -99,8 +99,7 @@ def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
 
 def poles_and_zeros(model: LinearModel) -> Figure:
     """Draw poles and zeros in the z plane, as ``zeros`` names them, with the unit circle."""
-    figure = Figure(figsize=(7.5, 5.5), layout="compressed")
-    ax = figure.subplots()
+    figure, ((ax,),) = panels((7.5, 5.5), layout="compressed")
     angle = np.linspace(0, 2 * np.pi, 361)
     ax.plot(np.cos(angle), np.sin(angle), lw=0.8, color="0.6")
     ax.axhline(0, lw=0.5, color="0.8", zorder=0)
@@ -134,8 +133,7 @@ def distortion(frf: FRF) -> Figure:
             "even distortion apart; use estimate_frf(records, method='fast')."
         )
     ny = len(frf.outputs)
-    figure = Figure(figsize=(8, 1.5 + 3.0 * ny), layout="constrained")
-    grid = figure.subplots(ny, 1, squeeze=False, sharex=True)
+    figure, grid = panels((8, 1.5 + 3.0 * ny), ny, sharex=True)
     for i, (output, ax) in enumerate(zip(frf.outputs, grid[:, 0], strict=True)):
         for level, label, colour, marker in (
             (levels.output, "output", MEASURED, "."),
@@ -155,8 +153,7 @@ def distortion(frf: FRF) -> Figure:
 
 def order_scan(scan: OrderScan) -> Figure:
     """Draw scores and errors of the fit against order, and singular values."""
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    errors, carried = figure.subplots(1, 2)
+    figure, ((errors, carried),) = panels((10, 4), 1, 2)
     score = "validation" if scan.validated else "score (MDL)"
     fitted = [np.nan if m.fit is None else m.fit.rmse for m in scan.models]
     errors.semilogy(scan.orders, fitted, "s-", ms=4, lw=0.8, color="0.5", label="fitted")

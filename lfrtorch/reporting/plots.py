@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
+from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.drawing import (
     CHANNELS,
     LINEAR,
     NL_LFR,
     OUTPUT,
     legend_above,
+    panels,
     plain_ticks,
     reference,
     unit_axis,
@@ -168,8 +171,7 @@ def distribution(
 
 def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Figure:
     """Draw errors on training and validation against iteration, the kept iterate marked."""
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    ax = figure.subplots()
+    figure, ((ax,),) = panels((7, 4))
     iterations = [p.iteration for p in history]
     train, validation = np.array([(p.train, p.validation) for p in history]).T
     factor, unit = engineering(train, unit)
@@ -191,15 +193,23 @@ def png(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
+def save(figures: Mapping[str, Figure], folder: Path) -> dict[str, bytes]:
+    """Write figures by name as PNG files into a folder, and return these."""
+    images = {name: png(figure) for name, figure in figures.items()}
+    for name, image in images.items():
+        with whole_file(folder / f"{name}.png") as fresh:
+            fresh.write_bytes(image)
+    return images
+
+
 def _panels(
     record: Record, outputs: Sequence[int] | None, width: float = _WIDE, *, sharex: bool = True
 ) -> tuple[Figure, dict[int, Axes]]:
     """A panel for each output, by its number."""
     numbers = list(range(record.y.shape[1]) if outputs is None else outputs)
-    figure = Figure(figsize=(width, _HEIGHT * len(numbers)), layout="constrained")
-    axes = figure.subplots(len(numbers), 1, squeeze=False, sharex=sharex)[:, 0]
+    figure, axes = panels((width, _HEIGHT * len(numbers)), len(numbers), sharex=sharex)
     figure.suptitle(f"{record.name} ({record.source})", fontsize="medium")
-    return figure, dict(zip(numbers, axes, strict=True))
+    return figure, dict(zip(numbers, axes[:, 0], strict=True))
 
 
 def _overlay(
@@ -216,16 +226,13 @@ def _overlay(
     # With ``fits`` the inputs stand above, as what the outputs answer to.
     numbers = list(range(record.y.shape[1]) if outputs is None else outputs)
     height = _HEIGHT * len(numbers) + _INPUTS * fits
-    figure = Figure(figsize=(width, height), layout="constrained")
     ratios = [1] * fits + [2, 1] * len(numbers)
-    grid = figure.add_gridspec(len(ratios), 1, height_ratios=ratios)
-    axes: list[Axes] = []
-    for row in range(fits, len(ratios)):
-        axes.append(figure.add_subplot(grid[row], sharex=axes[0] if axes else None))
+    figure, grid = panels((width, height), len(ratios), sharex=True, height_ratios=ratios)
+    axes: list[Axes] = [*grid[:, 0]]
     scored = slice(record.skip, None)
     t = (record.skip + np.arange(record.samples - record.skip)[part]) / record.fs
     for k, i in enumerate(numbers):
-        above, below = axes[2 * k : 2 * k + 2]
+        above, below = axes[2 * k + fits : 2 * k + fits + 2]
         y, output = record.y[scored, i], record.outputs[i]
         above.plot(*envelope(t, y[part]), lw=1.6, color=OUTPUT, label="measured")
         reach = 0.0
@@ -250,15 +257,13 @@ def _overlay(
             ax.grid(True, alpha=0.2)
         legend_above(above)
     if fits:
-        above = figure.add_subplot(grid[0], sharex=axes[0])
+        above = axes[0]
         for i, channel in enumerate(record.inputs[:_MOST_INPUTS]):
             above.plot(*envelope(t, record.u[scored, i][part]), lw=0.8, label=str(channel))
         above.set_ylabel("input")
+        above.margins(x=0)
         above.grid(True, alpha=0.2)
         legend_above(above)
-        axes.insert(0, above)
-    for ax in axes[:-1]:
-        ax.tick_params(labelbottom=False)
     figure.align_ylabels(axes)
     figure.suptitle(f"{record.name} ({record.source})", fontsize="medium")
     axes[-1].set_xlabel("time in the record (s)" if record.fs != 1.0 else "sample of the record")

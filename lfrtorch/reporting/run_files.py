@@ -69,10 +69,8 @@ def write(
     )
     if draw:
         drawn, views = figures.of_run(run)
-        images = {name: plots.png(figure) for name, figure in drawn.items()}
+        images = plots.save(drawn, folder / "figures")
         for name, image in images.items():
-            with whole_file(folder / "figures" / f"{name}.png") as fresh:
-                fresh.write_bytes(image)
             board.image(f"summary/{name}", image, result.iterations)
         page = html.render(run, images, views=views, command=command, config=config)
         with whole_file(folder / "report.html") as path:

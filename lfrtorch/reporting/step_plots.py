@@ -7,7 +7,7 @@ import math
 import numpy as np
 from matplotlib.figure import Figure
 
-from lfrtorch._support.drawing import CHANNELS, LINEAR, legend_above
+from lfrtorch._support.drawing import CHANNELS, LINEAR, legend_above, panels
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.data.records import Record
@@ -36,8 +36,7 @@ def steps(model: Model, linear: LinearModel, records: list[Record]) -> Figure:
     settled = _settling(linear, max(record.samples for record in records))
     inputs, outputs = model.inputs[:_MOST], model.outputs[:_MOST]
     size = 1.0 + 4.0 * len(inputs), 0.8 + 2.6 * len(outputs)
-    figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(len(outputs), len(inputs), squeeze=False, sharex=True)
+    figure, grid = panels(size, len(outputs), len(inputs), sharex=True)
     t = np.arange(settled) / model.fs
     still = _STILL * np.std(np.concatenate([record.y for record in records]), axis=0)
     for j, source in enumerate(inputs):

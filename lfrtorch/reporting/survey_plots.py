@@ -7,7 +7,7 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lfrtorch._support.drawing import CHANNELS, OUTPUT, unit_axis
+from lfrtorch._support.drawing import CHANNELS, OUTPUT, panels, unit_axis
 from lfrtorch._support.types import Array
 from lfrtorch.reporting.plots import envelope
 from lfrtorch.survey.measurement import Survey
@@ -17,8 +17,8 @@ from lfrtorch.survey.signal import LEAST, SignalSurvey, longest_run
 def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
     """Draw each of the signals (T, nu + ny), its values, and its spectrum with the band."""
     rows = len(found.signals)
-    figure = Figure(figsize=(13, 1.2 + 2.0 * rows), layout="constrained")
-    grid = figure.subplots(rows, 3, squeeze=False, sharex="col", width_ratios=[3.2, 0.8, 2.6])
+    widths = [3.2, 0.8, 2.6]
+    figure, grid = panels((13, 1.2 + 2.0 * rows), rows, 3, sharex="col", width_ratios=widths)
     fs = 1.0 if found.fs is None else found.fs
     t = np.arange(len(signals)) / fs
     for one, signal, (time, values, lines) in zip(found.signals, signals.T, grid, strict=True):
