@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,27 +13,9 @@ from torch import Tensor
 from torch.func import vjp, vmap
 
 from lfrtorch._support.threads import has_kernels, spread_loop, to_float64
+from lfrtorch._support.types import Array
 from lfrtorch.maps.machine_code import Code, call_slope, prepared
 from lfrtorch.maps.static_map import StaticMap
-
-
-class LinearisedMap(Protocol):
-    """Linearisation dw = J dz + (∂w/∂φ) dφ at every sample; φ are all weights in their order."""
-
-    J: Float[Tensor, "R T nw nz"]
-    """∂w/∂z."""
-
-    def by_weight(self) -> Float[Tensor, "R T nw P"]:
-        """∂w/∂φ."""
-        ...
-
-    def tangent(self, d_phi: Float[Tensor, " P"]) -> Float[Tensor, "R T nw"]:
-        """(∂w/∂φ) dφ."""
-        ...
-
-    def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R P"]:
-        """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
-        ...
 
 
 def linearise_map(
@@ -78,32 +61,31 @@ class CompiledMap:
     def __init__(
         self, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"], nw: int, code: Code
     ) -> None:
-        self._z, self._phi, self._code, self._like = to_float64(z), to_float64(phi), code, z
+        self._z, self._phi, self._code, self._dtype = to_float64(z), to_float64(phi), code, z.dtype
         self._shape = (*z.shape[:2], nw)
-        self.J = self._found(z.shape[2], 0)
+        self.J = self._run(_slopes, np.empty((*self._shape, z.shape[2])), 0)
 
     def by_weight(self) -> Float[Tensor, "R T nw P"]:
         """∂w/∂φ."""
-        return self._found(len(self._phi), 1)
+        return self._run(_slopes, np.empty((*self._shape, len(self._phi))), 1)
 
     def tangent(self, d_phi: Float[Tensor, " P"]) -> Float[Tensor, "R T nw"]:
         """(∂w/∂φ) dφ."""
-        out = np.empty(self._shape)
-        given = self._code.arguments, self._phi, self._z, to_float64(d_phi), out
-        spread_loop(_tangent, len(out), *given)
-        return torch.from_numpy(out).to(self._like.dtype)
+        return self._run(_tangent, np.empty(self._shape), to_float64(d_phi))
 
     def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R P"]:
         """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
         out = np.zeros((len(d_w), len(self._phi)))
-        given = self._code.arguments, self._phi, self._z, to_float64(d_w.contiguous()), out
-        spread_loop(_adjoint, len(out), *given)
-        return torch.from_numpy(out).to(self._like.dtype)
+        return self._run(_adjoint, out, to_float64(d_w.contiguous()))
 
-    def _found(self, columns: int, which: int) -> Tensor:
-        out = np.empty((*self._shape, columns))
-        spread_loop(_slopes, len(out), self._code.arguments, self._phi, self._z, which, out)
-        return torch.from_numpy(out).to(self._like.dtype)
+    def _run(self, kernel: Callable[..., None], out: Array, given: Any) -> Tensor:
+        """What a loop over the records writes of what it is given."""
+        spread_loop(kernel, len(out), self._code.arguments, self._phi, self._z, given, out)
+        return torch.from_numpy(out).to(self._dtype)
+
+
+LinearisedMap = TorchMap | CompiledMap
+"""Either: ∂w/∂z, ∂w/∂φ and products with it at every sample; φ are all weights in their order."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
