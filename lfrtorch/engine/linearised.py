@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -51,6 +51,12 @@ def linearise_at(W: Weights, J: Float[Tensor, "R T nw nz"]) -> Linearised:
     constant = torch.cat([W.A, W.Cy], dim=-2).flatten(-2).unsqueeze(-2)
     both = (J.flatten(-2) @ products + constant).unflatten(-1, (-1, W.nx))
     return Linearised(both[..., : W.nx, :], both[..., W.nx :, :])
+
+
+def fed_back(M: Any, J: Any) -> tuple[Any, Any, Any, Any]:
+    """A, B, C and D of the linear block of ``Matrices`` or ``Weights`` with w = J z about it."""
+    Bw, Dyw = M.Bw @ J, M.Dyw @ J
+    return M.A + Bw @ M.Cz, M.Bu + Bw @ M.Dzu, M.Cy + Dyw @ M.Cz, M.Dyu + Dyw @ M.Dzu
 
 
 def spectral_radius(matrices: Float[Tensor, "*axes n n"]) -> Float[Tensor, "*axes"]:

@@ -17,7 +17,7 @@ from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
 from lfrtorch.data.records import Scaler
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.linearised import static_slope
+from lfrtorch.engine.linearised import fed_back, static_slope
 from lfrtorch.engine.simulation import simulate
 
 _MAX_NEWTON = 50
@@ -71,10 +71,8 @@ def linearised_at(cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"
     They are A + Bw J Cz, Bu + Bw J Dzu, Cy + Dyw J Cz and Dyu + Dyw J Dzu, J = ∂w/∂z.
     """
     z, _ = cell.internal(u, x)
-    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
     J = to_float64(static_slope(cell, z[None, None])[0, 0])
-    Bw, Dyw = Bw @ J, Dyw @ J
-    return StateSpace(A + Bw @ Cz, Bu + Bw @ Dzu, Cy + Dyw @ Cz, Dyu + Dyw @ Dzu)
+    return StateSpace(*fed_back(cell.matrices(), J))
 
 
 @torch.no_grad()
@@ -92,40 +90,40 @@ def equilibrium(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nx"] 
     return x
 
 
-@torch.no_grad()
 def resting_input(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nu"] | None:
-    """Input nearest to u under which an integrating model is at rest; None if there is none."""
-    identity, x = torch.eye(cell.nx, dtype=u.dtype), u.new_zeros(cell.nx)
-    for _ in range(_MAX_NEWTON):
-        gap = cell(u, x)[1] - x
-        if gap.abs().max() <= _TOLERANCE * (1.0 + x.abs().max()):
-            return u
-        at = linearised_at(cell, u, x)
-        rows = torch.cat([identity - torch.as_tensor(at.A), -torch.as_tensor(at.B)], dim=1)
-        step = torch.linalg.pinv(rows, rtol=SINGULAR) @ gap
-        x, u = x + step[: cell.nx], u + step[cell.nx :]
-    return None
+    """The input next to u under which an integrating model is at rest, or None."""
+    found = _rest(cell, u, u.new_zeros(cell.nx), inputs=cell.nu)
+    return None if found is None else found[0]
 
 
-@torch.no_grad()
 def resting_near(
     cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"]
 ) -> Float[Tensor, " nx"] | None:
-    """Equilibrium that Newton's method finds from x; None if it finds none."""
+    """State at rest that Newton's method finds from x, or None."""
+    found = _rest(cell, u, x)
+    return None if found is None else found[1]
+
+
+@torch.no_grad()
+def _rest(
+    cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"], *, inputs: int = 0
+) -> tuple[Float[Tensor, " nu"], Float[Tensor, " nx"]] | None:
+    """Input and state at rest, by Newton's method in the state, and in the inputs if asked to."""
     identity = torch.eye(cell.nx, dtype=u.dtype)
     gap = cell(u, x)[1] - x
     for _ in range(_MAX_NEWTON):
         if gap.abs().max() <= _TOLERANCE * (1.0 + x.abs().max()):
-            return x
-        F = torch.as_tensor(linearised_at(cell, u, x).A)
-        step = torch.linalg.pinv(identity - F, rtol=SINGULAR) @ gap
+            return u, x
+        A, B, _, _ = map(torch.as_tensor, linearised_at(cell, u, x))
+        rows = torch.cat([identity - A, -B[:, :inputs]], dim=1)
+        step = torch.linalg.pinv(rows, rtol=SINGULAR) @ gap
         for _ in range(HALVINGS):
-            closer = x + step
-            left = cell(u, closer)[1] - closer
+            closer, beside = x + step[: cell.nx], u + step[cell.nx :] if inputs else u
+            left = cell(beside, closer)[1] - closer
             if left.norm() < gap.norm():  # False for NaN
                 break
             step = step / 2
         else:
             return None
-        x, gap = closer, left
+        u, x, gap = beside, closer, left
     return None
