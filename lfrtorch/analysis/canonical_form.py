@@ -26,7 +26,7 @@ from lfrtorch._support.types import Array, Complex
 from lfrtorch.data.records import Record, as_records
 from lfrtorch.engine.cell import LFRCell, Matrices
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.linearised import static_slope
+from lfrtorch.engine.linearised import fed_back, static_slope
 from lfrtorch.engine.operating_point import double
 from lfrtorch.linear.resolvent import frequency_response
 from lfrtorch.model.data_reach import whitening
@@ -135,12 +135,11 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
             "the static map is affine over the records: nothing of it is nonlinear. "
             "Give a model that was fitted, or records of larger inputs."
         )
-    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
-    A, Bu = A + Bw @ slope @ Cz, Bu + Bw @ slope @ Dzu
-    Cy, Dyu = Cy + Dyw @ slope @ Cz, Dyu + Dyw @ slope @ Dzu
+    A, Bu, Cy, Dyu = fed_back(cell.matrices(), slope)
+    block = cell.matrices()._replace(A=A, Bu=Bu, Cy=Cy, Dyu=Dyu)
     # w in coordinates of unit covariance, turned to the directions of its response in y.
     W = whitening(left)
-    responses = [_response(A, Bw, Cy, Dyw, one, W) for one in beyond]
+    responses = [_response(_turned(block, W=W), one @ W.T) for one in beyond]
     power, turn = _ordered(sum(responses, np.zeros((len(W), len(W)))))
     W = turn.T @ W
     # z, turned to the directions in which the slope of w changes the most.
@@ -150,27 +149,36 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     bends, turn = _ordered(np.einsum("swi,swj->ij", bent, bent) / len(bent))
     Z = turn.T @ Z
     circle = np.exp(2j * np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES)
-    Z = _signs(frequency_response(A, Bu, Z @ Cz, Z @ Dzu, circle), 1)[:, None] * Z
-    into_y = frequency_response(A, Bw @ _inverse(W), Cy, Dyw @ _inverse(W), circle)
-    W = _signs(into_y, 2)[:, None] * W
+    M = _turned(block, Z=Z, W=W)
+    Z = _signs(frequency_response(M.A, M.Bu, M.Cz, M.Dzu, circle), 1)[:, None] * Z
+    W = _signs(frequency_response(M.A, M.Bw, M.Cy, M.Dyw, circle), 2)[:, None] * W
     # x, turned to the axes of the observability Gramian.
     X = whitening(x_all)
-    seen = np.vstack([Cy, Z @ Cz]) @ _inverse(X)
-    G = frequency_response(X @ A @ _inverse(X), np.eye(len(A)), seen, np.zeros_like(seen), circle)
+    M = _turned(block, X, Z, W)
+    seen = np.vstack([M.Cy, M.Cz])
+    G = frequency_response(M.A, np.eye(len(A)), seen, np.zeros_like(seen), circle)
     _, turn = _ordered(np.einsum("fsi,fsj->ij", G.conj(), G).real)
     X = turn.T @ X
     seen = seen @ turn
     largest = np.take_along_axis(seen, np.abs(seen).argmax(axis=0)[None], 0)
     X = np.where(largest < 0, -1.0, 1.0).T * X  # what nobody sees keeps its sign
-    back, out = _inverse(X), _inverse(W)
-    matrices = Matrices(
-        A=X @ A @ back, Bu=X @ Bu, Bw=X @ Bw @ out, Cz=Z @ Cz @ back, Dzu=Z @ Dzu,
-        Cy=Cy @ back, Dyu=Dyu, Dyw=Dyw @ out,
-    )  # fmt: skip
     K = None if model.K is None else torch.as_tensor(X) @ model.K.double().cpu()
     same = replace(model, lfr=LFR(_in_coordinates(cell, X)), K=K)
     shares, bends = (part / max(part.sum(), 1e-300) for part in (power, bends))
-    return Canonical(same, matrices, slope, X, Z, W, shares, bends)
+    return Canonical(same, _turned(block, X, Z, W), slope, X, Z, W, shares, bends)
+
+
+def _turned(
+    M: Matrices, X: Array | None = None, Z: Array | None = None, W: Array | None = None
+) -> Matrices:
+    """The linear block in the coordinates X x, Z z and W w; None leaves a signal as it is."""
+    sizes = len(M.A), len(M.Cz), M.Bw.shape[1]
+    X, Z, W = (np.eye(n) if T is None else T for n, T in zip(sizes, (X, Z, W), strict=True))
+    back, out = _inverse(X), _inverse(W)
+    return Matrices(
+        A=X @ M.A @ back, Bu=X @ M.Bu, Bw=X @ M.Bw @ out, Cz=Z @ M.Cz @ back, Dzu=Z @ M.Dzu,
+        Cy=M.Cy @ back, Dyu=M.Dyu, Dyw=M.Dyw @ out,
+    )  # fmt: skip
 
 
 @torch.no_grad()
@@ -178,10 +186,7 @@ def _in_coordinates(cell: LFRCell, X: Float[Array, "nx nx"]) -> LFRCell:
     """The cell with the states X x."""
     sizes = cell.nu, cell.ny, cell.nx, cell.nz, cell.nw
     found = LFRCell(*sizes, deepcopy(cell.static), dtype=torch.float64, random=False)
-    M, back = cell.matrices(), _inverse(X)
-    turned = {"A": X @ M.A @ back, "Bu": X @ M.Bu, "Bw": X @ M.Bw}
-    turned |= {"Cz": M.Cz @ back, "Cy": M.Cy @ back}
-    for name, value in {**M._asdict(), **turned}.items():
+    for name, value in _turned(cell.matrices(), X)._asdict().items():
         found.get_parameter(name).copy_(torch.as_tensor(value))
     P = torch.as_tensor(X)
     found.state_covariance.copy_(P @ cell.state_covariance @ P.mT)
@@ -207,18 +212,15 @@ def _ordered(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Arr
     return np.maximum(values[::-1], 0.0), vectors[:, ::-1]
 
 
-def _response(
-    A: Array, Bw: Array, Cy: Array, Dyw: Array, w: Float[Array, "T nw"], W: Float[Array, "nw nw"]
-) -> Float[Array, "nw nw"]:
-    """Products of the responses in y from the entries of W w, by the power that w has there.
+def _response(M: Matrices, w: Float[Array, "T nw"]) -> Float[Array, "nw nw"]:
+    """Products of the responses in y from the entries of w, by the power that w has there.
 
     It is computed from frequency responses, which an unstable linear block has, too.
     """
     lines = np.asarray(np.fft.rfftfreq(len(w)), dtype=np.float64)
     z = np.exp(2j * np.pi * (lines + 0.5 / len(w)))  # between the lines: no pole at 1 is hit
-    out = _inverse(W)
-    G = frequency_response(A, Bw @ out, Cy, Dyw @ out, z)
-    power = np.sum(np.abs(np.fft.rfft(w @ W.T, axis=0)) ** 2, axis=1)
+    G = frequency_response(M.A, M.Bw, M.Cy, M.Dyw, z)
+    power = np.sum(np.abs(np.fft.rfft(w, axis=0)) ** 2, axis=1)
     return np.einsum("fyi,fyj,f->ij", G.conj(), G, power).real
 
 
@@ -229,6 +231,3 @@ def _signs(G: Complex128[Complex, "F n m"], axis: int) -> Float[Array, " K"]:
     each = np.moveaxis(impulse, axis, 0).reshape(G.shape[axis], -1)
     largest = each[np.arange(len(each)), np.abs(each).argmax(axis=1)]
     return np.where(largest < 0, -1.0, 1.0)
-
-
-__all__ = ["Canonical", "canonical"]

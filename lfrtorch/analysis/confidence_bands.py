@@ -12,7 +12,7 @@ dg/dθ of that covariance. J is computed in the identifiable columns only (see `
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 
@@ -23,12 +23,11 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtri
 from torch import Tensor
 from torch.autograd.functional import jacobian
-from torch.func import functional_call
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import number as check_number
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.tables import in_lines, number, percent, quantities, table
+from lfrtorch._support.tables import in_lines, number, percent, quantity, table
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.gradients import Gradients, root
 from lfrtorch.analysis.linearisation import linear_part, linearise
@@ -40,9 +39,12 @@ from lfrtorch.analysis.training_reach import TrainingReach
 from lfrtorch.data.records import Channel, Record, as_records, as_signal
 from lfrtorch.engine.held import held_parameters
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.operating_point import SINGULAR, equilibrium, linearised_at
+from lfrtorch.engine.linearised import fed_back
+from lfrtorch.engine.operating_point import SINGULAR, linearised_at
+from lfrtorch.engine.weights import Weights
 from lfrtorch.least_squares.gauge import reduction
 from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator
+from lfrtorch.least_squares.simulation_errors import Parameters
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.data_reach import FARTHEST
 from lfrtorch.model.model import Model
@@ -147,15 +149,9 @@ class Uncertainty:
     @property
     def covariance(self) -> Float[Array, "P P"]:
         """Covariance of all free parameters, in the order of ``model.lfr``; 0 for held ones."""
-        wide = np.concatenate([*self._factors().values()])
-        return wide @ wide.T
-
-    def _factors(self) -> dict[str, Array]:
-        """Rows of a factor of that covariance, by the name of the parameter."""
-        free = {n: p.numel() for n, p in self.model.lfr.cell.named_parameters() if p.requires_grad}
-        wide = np.zeros((sum(free.values()), self.factor.shape[1]))
+        wide = np.zeros((Parameters(self.model.lfr.cell, 0).own, self.factor.shape[1]))
         wide[self.kept.numpy()] = self.factor.numpy()
-        return dict(zip(free, np.split(wide, np.cumsum([*free.values()])[:-1]), strict=True))
+        return wide @ wide.T
 
     def simulate(self, data: Record | ArrayLike) -> Band:
         """Simulated output with its band, and how far the input is from the data.
@@ -184,14 +180,15 @@ class Uncertainty:
             y = np.zeros((len(u), len(model.outputs)))
             record = Record(u, y, model.fs, inputs=model.inputs, outputs=model.outputs)
         along = Gradients(model, record, self.kept, fitted=False)
+        along.basis = self.factor
         y = scaler.restore_y(along.trajectory.y[0].numpy())
-        K, variance, surprises = len(self.kept), np.full(y.shape, np.nan), np.full(len(y), np.nan)
+        variance, surprises = np.full(y.shape, np.nan), np.full(len(y), np.nan)
         if np.isfinite(y).all():
             start = along.start_factor(self.colour) if along.estimated else self.factor[:0, :0]
-            own, variance = np.zeros(y.shape), np.zeros(y.shape)
+            own, m = np.zeros(y.shape), self.factor.shape[1]
             for time, rows in along.blocks():
-                own[time] = (rows[..., :K] @ self.factor).square().sum(-1).numpy()
-                variance[time] = (rows[..., K:] @ start).square().sum(-1).numpy()
+                own[time] = rows[..., :m].square().sum(-1).numpy()
+                variance[time] = (rows[..., m:] @ start).square().sum(-1).numpy()
             variance += own
             surprises = self.reach.surprises(along.trajectory.z[0].numpy(), own)
         std = np.sqrt(variance) * scaler.y_scale
@@ -206,11 +203,7 @@ class Uncertainty:
             >>> bool(pole.frequency > 0), bool(pole.frequency_std > 0)
             (True, True)
         """
-        factors, names = self._factors(), ("A", "Bu", "Cy", "Dyu")
-        sizes = [self.model.lfr.cell.get_parameter(name).numel() for name in names]
-        held = [np.zeros((size, self.factor.shape[1])) for size in sizes]
-        parts = [factors.get(name, none) for name, none in zip(names, held, strict=True)]
-        return self._with_covariance(linear_part(self.model), np.concatenate(parts))
+        return self._known(linear_part(self.model), lambda W: (W.A, W.Bu, W.Cy, W.Dyu))
 
     def linearise(self, u: ArrayLike | None = None) -> LinearModel:
         """The model about its rest, as ``lfrtorch.analysis.linearise``, with its covariance.
@@ -230,15 +223,23 @@ class Uncertainty:
             ((2, 1, 1), True)
         """
         found = linearise(self.model, u)
-        G = _derivative_at_rest(self.model, found.u_offset)[:, self.kept.numpy()]
-        return self._with_covariance(found, G @ self.factor.numpy())
+        assert found.x_offset is not None
+        return self._known(found, _at_rest(self.model, found.u_offset, found.x_offset))
 
-    def _with_covariance(self, linear: LinearModel, factor: Float[Array, "n m"]) -> LinearModel:
-        """A linear model in physical units, from a factor in normalised ones."""
-        nx, ny = linear.nx, len(linear.D)
-        u, y = self.model.scaler.u_scale, self.model.scaler.y_scale[:, None]
-        scales = [np.ones((nx, nx)), np.ones((nx, 1)) / u, y * np.ones((ny, nx)), y / u]
-        physical = factor * np.concatenate([s.ravel() for s in scales])[:, None]
+    def _known(
+        self, linear: LinearModel, matrices: Callable[[Weights], Sequence[Tensor]]
+    ) -> LinearModel:
+        """A linear model with the covariance of its matrices, which are functions of θ."""
+        parameters, s, nx = Parameters(self.model.lfr.cell, 0), self.model.scaler, linear.nx
+
+        def entries(theta: Float[Tensor, " P"]) -> Float[Tensor, " n"]:
+            return torch.cat([M.flatten() for M in matrices(parameters.weights(theta))])
+
+        with torch.enable_grad():
+            G = torch.as_tensor(jacobian(entries, parameters.start))[:, self.kept]
+        u, y = s.u_scale, s.y_scale[:, None]
+        scales = [np.ones((nx, nx)), np.ones((nx, 1)) / u, y * np.ones((len(y), nx)), y / u]
+        physical = (G @ self.factor).numpy() * np.concatenate([s.ravel() for s in scales])[:, None]
         return replace(linear, covariance=physical @ physical.T)
 
     def __repr__(self) -> str:
@@ -246,16 +247,10 @@ class Uncertainty:
 
     def __str__(self) -> str:
         head = ["output", "noise", "order of its model", "mean std of y / rms of y"]
-        noise = [
-            quantities([value], channel.unit)[0]
-            for value, channel in zip(self.noise, self.model.outputs, strict=True)
-        ]
-        orders = [len(a) - 1 for a in self.colour.a]
+        columns = zip(self.model.outputs, self.noise, self.colour.a, self.relative, strict=True)
         rows = [
-            [channel.name, size, order, percent(float(relative))]
-            for channel, size, order, relative in zip(
-                self.model.outputs, noise, orders, self.relative, strict=True
-            )
+            [channel.name, quantity(size, channel.unit), len(a) - 1, percent(float(relative))]
+            for channel, size, a, relative in columns
         ]
         held = sum(p.numel() for p in self.model.lfr.parameters()) - len(self.kept)
         lines = [
@@ -321,23 +316,22 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
                 "fitted to."
             )
     W, seen, left = _directions(every, model)
-    sizes, colour, deviations = _noise(every, W)
-    rank, K = int((seen == 1).sum()), len(kept)
-    # A direction that the data do not tell has the variance of the least one that they do.
-    meat = torch.diag(float(np.trace(colour.covariance)) / cell.ny * (1.0 - seen.square()))
+    for along in every:
+        along.basis = W
+    sizes, colour, deviations = _noise(every)
+    total = GramAccumulator()
     for along, own in zip(every, sizes, strict=True):
-        total = GramAccumulator()
-        for _, rows, _ in along.weighted():
-            total.fold(torch.as_tensor(own.coloured((rows @ W).numpy())))
-        meat += total.G
-    factor = W @ root(meat)
-    zs, variances = [], []
+        for _, Q, _ in along.weighted():
+            total.fold(own.coloured(Q))
+    # A direction that the data do not tell has the variance of the least one that they do.
+    untold = torch.diag(float(np.trace(colour.covariance)) / cell.ny * (1.0 - seen.square()))
+    spread_of, rank, zs, variances = root(untold + total.G), int((seen == 1).sum()), [], []
     for along in every:
         scored = slice(along.record.skip, None)
-        parts = [(rows[..., :K] @ factor).square().sum(-1) for _, rows in along.blocks()]
+        parts = [(Q[..., : len(kept)] @ spread_of).square().sum(-1) for _, Q in along.blocks()]
         if not along.group.spectral:
             # As if the sample were not among those that the model is fitted to.
-            taken = [(rows @ W).square().sum(-1) for _, rows, _ in along.weighted()]
+            taken = [Q.square().sum(-1) for _, Q, _ in along.weighted()]
             parts = [p / (1.0 - h).clamp_min(LEAST) for p, h in zip(parts, taken, strict=True)]
         zs.append(along.trajectory.z[0, scored].numpy())
         variances.append(torch.cat(parts)[scored].numpy())
@@ -348,12 +342,12 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
         records=tuple(record.name for record in listed),
         samples=sum(record.samples - record.skip for record in listed),
         kept=kept,
-        factor=factor,
+        factor=W @ spread_of,
         rank=rank,
         noise=deviations * model.scaler.y_scale,
         relative=np.sqrt(variance).mean(axis=0) / np.maximum(y.std(axis=0), 1e-300),
-        doubts=_doubts(every, model, W, sizes, rank, left)
-        + _clipped(every, W, meat, torch.as_tensor(deviations)),
+        doubts=_doubts(every, model, sizes, rank, left)
+        + _clipped(every, spread_of, torch.as_tensor(deviations)),
         colour=colour,
         reach=TrainingReach.of(np.concatenate(zs), variance),
     )
@@ -394,7 +388,7 @@ def _directions(
 
 
 def _noise(
-    every: Sequence[Gradients], W: Float[Tensor, "K K"]
+    every: Sequence[Gradients],
 ) -> tuple[list[NoiseModel], NoiseModel, Float[Array, " ny"]]:
     """The noise of each record as it is weighted, that of all of one size, and its deviations.
 
@@ -406,7 +400,7 @@ def _noise(
     for along in every:
         counted, taken = np.zeros((2, ny))
         for _, rows, errors in along.weighted():
-            Q = (rows @ W).numpy()
+            Q = rows.numpy()
             counted += np.any(Q, axis=2).sum(axis=0)
             taken += np.square(Q).sum(axis=(0, 2))
             if not along.group.spectral:
@@ -414,30 +408,25 @@ def _noise(
         left.append(np.maximum(counted - taken, np.maximum(LEAST * counted, 1.0)))
     white = tuple(np.ones(1) for _ in range(ny))
     a, variances = colours(spectra) if spectra.samples.any() else (white, np.zeros(ny))
+    colour_of = [white if along.group.spectral else a for along in every]
     products, power = [], np.zeros(ny)
-    for along in every:
-        errors = along.group.weigh(along.errors[None])[0].numpy()
-        e = errors if along.group.spectral else innovations(a, errors)
+    for along, own in zip(every, colour_of, strict=True):
+        e = innovations(own, along.group.weigh(along.errors[None])[0].numpy())
         products.append(e.T @ e)
         counted = along.group.scored if along.group.spectral else along.group.weight != 0
         power += np.square((along.errors * counted[0]).numpy()).sum(axis=0)
-    plain = [i for i, along in enumerate(every) if not along.group.spectral] or range(len(every))
-    pooled = _ratio(
-        np.sum([products[i] for i in plain], axis=0), np.sum([left[i] for i in plain], axis=0)
-    )
+    plain = [i for i, own in enumerate(colour_of) if own is a] or range(len(every))
+    pooled = _ratio(*(np.sum([each[i] for i in plain], axis=0) for each in (products, left)))
     # The spectra know better than n - p how much of the noise the fit took.
-    known = np.diag(pooled) > 0
-    gain = np.ones(ny)
+    known, gain = np.diag(pooled) > 0, np.ones(ny)
     if spectra.samples.any():
         gain[known] = np.sqrt(variances[known] / np.diag(pooled)[known])
-    each = []
-    for along, product, dof in zip(every, products, left, strict=True):
-        own = _ratio(product, dof)
-        if along.group.spectral:
-            each.append(NoiseModel(white, own))
-        else:
-            each.append(NoiseModel(a, gain[:, None] * own * gain))
-    return each, NoiseModel(a, gain[:, None] * pooled * gain), np.sqrt(power / np.sum(left, axis=0))
+    each = [
+        NoiseModel(own, _ratio(product, dof) * (np.outer(gain, gain) if own is a else 1.0))
+        for own, product, dof in zip(colour_of, products, left, strict=True)
+    ]
+    deviations = np.sqrt(power / np.sum(left, axis=0))
+    return each, NoiseModel(a, pooled * np.outer(gain, gain)), deviations
 
 
 def _ratio(product: Float[Array, "ny ny"], left: Float[Array, " ny"]) -> Float[Array, "ny ny"]:
@@ -445,18 +434,16 @@ def _ratio(product: Float[Array, "ny ny"], left: Float[Array, " ny"]) -> Float[A
     return product / np.sqrt(np.outer(left, left))
 
 
-def _weighted_step(
-    every: Sequence[Gradients], W: Float[Tensor, "K K"], sizes: Sequence[NoiseModel]
-) -> Float[Tensor, " K"]:
+def _weighted_step(every: Sequence[Gradients], sizes: Sequence[NoiseModel]) -> Float[Tensor, " K"]:
     """Gauss-Newton step of a fit that weights each record by one over its noise."""
-    K = len(W)
     total = QRAccumulator()
     for along, own in zip(every, sizes, strict=True):
         power = torch.as_tensor(np.diag(own.covariance).copy())
         by = torch.where(power > 0, power, torch.inf).rsqrt().unsqueeze(-1)
-        for _, rows, errors in along.weighted():
-            total.fold((torch.cat([rows @ W, -errors.unsqueeze(-1)], -1) * by).flatten(0, 1))
-    return W @ torch.linalg.pinv(total.R[:K, :K], rtol=_TRUNCATION) @ total.R[:K, K]
+        for _, Q, errors in along.weighted():
+            total.fold((torch.cat([Q, -errors.unsqueeze(-1)], -1) * by).flatten(0, 1))
+    R = total.R[: total.R.shape[1] - 1]
+    return torch.linalg.pinv(R[:, :-1], rtol=_TRUNCATION) @ R[:, -1]
 
 
 def _dependent(
@@ -477,7 +464,7 @@ def _dependent(
     return [
         (part, name)
         for part in parts
-        for name, each in (("inputs", part.linear), ("even", part.even), ("odd", part.odd))
+        for name, each in part.tests.items()
         if tests * part.p[name] <= LEVEL
         and max(abs(c.at(c.largest)[0]) for c in each) >= SLIGHT
         and not part.exact
@@ -487,7 +474,6 @@ def _dependent(
 def _doubts(
     every: Sequence[Gradients],
     model: Model,
-    W: Float[Tensor, "K K"],
     sizes: Sequence[NoiseModel],
     rank: int,
     left: tuple[float, float],
@@ -497,7 +483,7 @@ def _doubts(
     wrong = _dependent(every, model)
     if wrong and len(every) > 1:
         # Noise of a loud record, in the parameters, shows in the residuals of a quiet one.
-        wrong = _dependent(every, model, _weighted_step(every, W, sizes))
+        wrong = _dependent(every, model, _weighted_step(every, sizes))
     if wrong:
         part, name = min(wrong, key=lambda pair: pair[0].p[pair[1]])
         what = {
@@ -514,22 +500,19 @@ def _doubts(
             f"{NOT_AT_MINIMUM}: a step would be {number(left[0], 2)} standard errors "
             f"long and lower the squared error by {percent(left[1])}; bands are about the minimum."
         )
-    if rank < len(W):
+    if rank < (K := len(every[0].kept)):
         found.append(
-            f"the data tell {rank} of {len(W)} directions of the parameters; where the others "
+            f"the data tell {rank} of {K} directions of the parameters; where the others "
             "matter, surprise and bands are large."
         )
     return tuple(found)
 
 
 def _clipped(
-    every: Sequence[Gradients],
-    W: Float[Tensor, "K K"],
-    meat: Float[Tensor, "K K"],
-    noise: Float[Tensor, " ny"],
+    every: Sequence[Gradients], spread_of: Float[Tensor, "K m"], noise: Float[Tensor, " ny"]
 ) -> tuple[str, ...]:
     """How far noise that the limits of a sensor cut off has shifted the fit, if that is far."""
-    K, total = len(W), W.new_zeros(len(W))
+    K, total = len(spread_of), spread_of.new_zeros(len(spread_of))
     for along in every:
         if along.group.limits is None or not noise.all():
             continue
@@ -543,7 +526,7 @@ def _clipped(
         mean *= torch.as_tensor(along.record.factors).square()
         for time, rows in along.blocks():
             total += torch.einsum("tok,to->k", rows[..., :K], mean[time])
-    shift = torch.linalg.pinv(root(meat), rtol=_TRUNCATION) @ (W.mT @ total)
+    shift = torch.linalg.pinv(spread_of, rtol=_TRUNCATION) @ total
     errors = float(shift.square().mean().sqrt())
     if errors < _SHIFTED:
         return ()
@@ -554,38 +537,23 @@ def _clipped(
     )
 
 
-def _derivative_at_rest(model: Model, u: Float[Array, " nu"]) -> Float[Array, "n P"]:
-    """Derivatives of A, B, C and D about the rest under u, normalised, with the free parameters.
+def _at_rest(
+    model: Model, u: Float[Array, " nu"], rest: Float[Array, " nx"]
+) -> Callable[[Weights], Sequence[Tensor]]:
+    """A, B, C and D about the rest under u, normalised, by all numbers of the model.
 
     One step of Newton's method from the rest, x + (I - F)⁻¹ (f(x, u) - x) with F held, has the same
     first derivatives as the rest itself.
     """
-    cell, scaler = model.lfr.cell, model.scaler
-    v = torch.as_tensor((u - scaler.u_offset) / scaler.u_scale)
-    rest = equilibrium(cell, v)
-    assert rest is not None  # linearise has found it
-    identity = torch.eye(cell.nx, dtype=v.dtype)
-    F = torch.as_tensor(linearised_at(cell, v, rest).A)
-    inverse = torch.linalg.pinv(identity - F, rtol=SINGULAR)
-    names = [name for name, p in cell.named_parameters() if p.requires_grad]
-    values = tuple(p.detach() for p in cell.parameters() if p.requires_grad)
+    v, x = torch.as_tensor(model.scaler.normalise_u(u)), torch.as_tensor(rest)
+    F = torch.as_tensor(linearised_at(model.lfr.cell, v, x).A)
+    inverse = torch.linalg.pinv(torch.eye(len(x), dtype=x.dtype) - F, rtol=SINGULAR)
 
-    def matrices(*own: Tensor) -> Tensor:
-        weights = dict(zip(names, own, strict=True))
+    def matrices(W: Weights) -> Sequence[Tensor]:
+        z, _ = W.internal(v, x + inverse @ (W.step(v, x) - x))
+        return fed_back(W, W.map.slope(z[None, None], W.phi)[0, 0])
 
-        def step(x: Tensor, at: Tensor) -> Tensor:
-            y, ahead = functional_call(cell, weights, (at, x))
-            return torch.cat([ahead, y])
-
-        x = rest + inverse @ (step(rest, v)[: cell.nx] - rest)
-        by_x, by_u = jacobian(step, (x, v), create_graph=True)
-        nx = cell.nx
-        parts = by_x[:nx], by_u[:nx], by_x[nx:], by_u[nx:]
-        return torch.cat([part.flatten() for part in parts])
-
-    with torch.enable_grad():
-        found = jacobian(matrices, values)
-    return torch.cat([part.flatten(1) for part in found], dim=1).numpy()
+    return matrices
 
 
 @typed()

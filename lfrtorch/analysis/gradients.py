@@ -45,29 +45,34 @@ class Gradients:
         fitted: bool,
         hold: bool = False,
     ) -> None:
-        errors = SimulationErrors(
-            model.lfr.cell,
-            [model.scaler.normalise(record)],
-            solve_initial_states=not fitted,
-        )
+        records = [model.scaler.normalise(record)]
+        errors = SimulationErrors(model.lfr.cell, records, solve_initial_states=not fitted)
         self.record, self.kept = record, kept
+        self.basis = torch.eye(len(kept), dtype=torch.float64)
+        """Directions of the kept parameters, one for each column of what ``blocks`` yields."""
         _, (self.trajectory,) = errors.evaluate(errors.first_theta())
-        group: RecordGroup = errors.groups[0].counted(self.trajectory.y)
-        self.group = group
-        periodic, self.estimated = group.start.periodic, group.start.fitted
-        self._along = Linearisation(model.lfr.cell, group.u, self.trajectory, periodic=periodic)
-        self._hold = hold
-        self._held: list[tuple[slice, Tensor]] = []
-        self._initial: Tensor | None = None
+        self.group: RecordGroup = errors.groups[0].counted(self.trajectory.y)
+        periodic, self.estimated = self.group.start.periodic, self.group.start.fitted
+        self._along = Linearisation(
+            model.lfr.cell, self.group.u, self.trajectory, periodic=periodic
+        )
+        self._held: list[tuple[slice, Tensor]] | None = [] if hold else None
+        self._weight = self.group.weight if fitted else self.group.start_weight
         self._inverse = self.group.y.new_zeros(0, 0)  # R⁻¹ of the weighted rows X: X R⁻¹ is Q
-        self._weight = group.weight if fitted else group.start_weight
-        if torch.isfinite(self.trajectory.y).all():
-            if periodic:
-                *_, (_, _, end) = self._blocks(start=True)
-                K = len(kept)
-                self._initial = fixed_point(end[None, :, K:], end[None, :, :K])[0]
-            elif self.estimated:
-                self._initial = self._estimated()
+        self._initial: Tensor | None = None  # dx0/dθ
+        K, nx = len(kept), model.lfr.cell.nx
+        if not torch.isfinite(self.trajectory.y).all():
+            return
+        if periodic:
+            *_, (_, _, end) = self._blocks(start=True)
+            self._initial = fixed_point(end[None, :, K:], end[None, :, :K])[0]
+        elif self.estimated:
+            total = QRAccumulator()
+            for rows in self._start_rows():
+                total.fold(rows)
+            R = total.R[:nx]
+            self._inverse = torch.linalg.pinv(R[:, :nx], rtol=_SEEN)
+            self._initial = -self._inverse @ R[:, nx:]
 
     @property
     def errors(self) -> Float[Tensor, "T ny"]:
@@ -75,25 +80,28 @@ class Gradients:
         return (self.trajectory.y - self.group.y)[0]
 
     def blocks(self) -> Iterator[tuple[slice, Float[Tensor, "B ny C"]]]:
-        """Samples and their rows; nx columns of an estimated start state follow the K others."""
-        if self._held:
-            yield from self._held
-            return
+        """Samples and their rows; nx columns of an estimated start state follow the others."""
+        K = len(self.kept)
+        for time, rows in self._held or self._moved():
+            yield time, torch.cat([rows[..., :K] @ self.basis, rows[..., K:]], -1)
+
+    def _moved(self) -> Iterator[tuple[slice, Float[Tensor, "B ny C"]]]:
+        """Samples and their rows by the kept parameters, which move the start state, too."""
         K = len(self.kept)
         for time, found, _ in self._blocks(start=self._initial is not None):
             rows = found
             if self._initial is not None:
-                rows = found[..., :K] + found[..., K:] @ self._initial
-                rows = torch.cat([rows, found[..., K:]], -1) if self.estimated else rows
-            if self._hold:
+                own = found[..., :K] + found[..., K:] @ self._initial
+                rows = torch.cat([own, found[..., K:]], -1) if self.estimated else own
+            if self._held is not None:
                 self._held.append((time, rows))
             yield time, rows
 
     def weighted(self) -> Iterator[tuple[slice, Float[Tensor, "m ny K"], Float[Tensor, "m ny"]]]:
-        """The K columns and the errors, weighted as in a fit; real, then imaginary if by line."""
-        K, group = len(self.kept), self.group
+        """Those columns and the errors, weighted as in a fit; real, then imaginary if by line."""
+        group, m = self.group, self.basis.shape[1]
         for time, rows in self.blocks():
-            part, errors = rows[None, ..., :K], self.errors[None, time]
+            part, errors = rows[None, ..., :m], self.errors[None, time]
             yield time, group.weigh(part, time=time)[0], group.weigh(errors, time=time)[0]
 
     def _blocks(self, *, start: bool) -> Iterator[tuple[slice, Tensor, Tensor]]:
@@ -104,21 +112,12 @@ class Gradients:
         for block in self._along.rows(self.kept, initial_state=start, out=out):
             yield block.time, block.rows[0], block.end[0]
 
-    def _estimated(self) -> Float[Tensor, "nx K"]:
-        total, nx = QRAccumulator(), self._along.state.shape[1]
-        for rows in self._start_rows():
-            total.fold(rows)
-        R = total.R[:nx]
-        self._inverse = torch.linalg.pinv(R[:, :nx], rtol=_SEEN)
-        return -self._inverse @ R[:, nx:]
-
     def start_factor(self, noise: NoiseModel) -> Float[Tensor, "nx m"]:
         """S, so that S Sᵀ is what noise adds to the covariance of an estimated start state."""
-        nx = len(self._inverse)
+        nx, ny = len(self._inverse), self.group.y.shape[2]
         total = GramAccumulator()
         for rows in self._start_rows():
-            Q = (rows[:, :nx] @ self._inverse).unflatten(0, (-1, self.group.y.shape[2]))
-            total.fold(torch.as_tensor(noise.coloured(Q.numpy())))
+            total.fold(noise.coloured((rows[:, :nx] @ self._inverse).unflatten(0, (-1, ny))))
         return self._inverse @ root(total.G)
 
     def _start_rows(self) -> Iterator[Float[Tensor, "m C"]]:

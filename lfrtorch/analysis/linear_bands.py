@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,33 +115,22 @@ def pole_bands(model: LinearModel) -> tuple[PoleBand, ...]:
     """
     nx = model.nx
     covariance = known(model.covariance)[: nx * nx, : nx * nx]
-    poles, right = np.linalg.eig(model.A)
-    left = np.linalg.pinv(right)
-    found = []
-    for i, z in enumerate(poles):
-        if z.imag < 0:
-            continue
-        # dz = left dA right, and s = fs log z.
-        d_z = np.asarray(np.outer(left[i], right[:, i]).ravel(), dtype=np.complex128)
-        radius = abs(z)
-        s = model.fs * complex(math.log(max(radius, 1e-300)), np.angle(z))
-        d_s = d_z * (model.fs / z) if radius > 0 else np.full_like(d_z, np.nan)
-        size = abs(s) or math.nan
-        d_size = (np.conj(s) * d_s).real / size
-        d_damping = -d_s.real / size + s.real * d_size / size**2
-        found.append(
-            PoleBand(
-                complex(z),
-                math.hypot(_std(d_z.real, covariance), _std(d_z.imag, covariance)),
-                size / (2 * math.pi),
-                _std(d_size, covariance) / (2 * math.pi),
-                -s.real / size,
-                _std(d_damping, covariance),
-            )
-        )
+    poles, right = (np.asarray(part, np.complex128) for part in np.linalg.eig(model.A))
+    upper = poles.imag >= 0
+    z, left = poles[upper], np.linalg.pinv(right)[upper]
+    # dz = left dA right, and s = fs log z, columns for each pole.
+    d_z = np.einsum("pi,jp->ijp", left, right[:, upper]).reshape(nx * nx, -1)
+    radius = np.abs(z)
+    s = model.fs * (np.log(np.maximum(radius, 1e-300)) + 1j * np.angle(z))
+    d_s = d_z * np.divide(model.fs, z, out=np.full_like(z, np.nan), where=radius > 0)
+    size = np.where(s == 0, np.nan, np.abs(s))
+    d_size = (s.conj() * d_s).real / size
+    d_damping = -d_s.real / size + s.real * d_size / size**2
+    stds = [
+        np.sqrt(np.einsum("ap,ab,bp->p", d, covariance, d).clip(0.0))
+        for d in (d_z.real, d_z.imag, d_size / (2 * np.pi), d_damping)
+    ]
+    of_z, frequency, damping = np.hypot(*stds[:2]), size / (2 * np.pi), -s.real / size
+    columns = zip(z.tolist(), of_z, frequency, stds[2], damping, stds[3], strict=True)
+    found = [PoleBand(pole, *map(float, numbers)) for pole, *numbers in columns]
     return tuple(sorted(found, key=lambda pole: (pole.frequency, pole.damping)))
-
-
-def _std(gradient: Array, covariance: Array) -> float:
-    variance = gradient @ covariance @ gradient
-    return math.sqrt(variance) if variance > 0 else 0.0 * float(variance)

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
+import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from lfrtorch._support.types import Array
 
@@ -68,19 +70,20 @@ class NoiseModel:
     a: tuple[Array, ...]  # coefficients 1, a1, a2 ... of each output
     covariance: Float[Array, "ny ny"]
 
-    def coloured(self, Q: Float[Array, "m ny K"]) -> Float[Array, "m2 K"]:
+    def coloured(self, Q: Float[Tensor, "m ny K"]) -> Float[Tensor, "m2 K"]:
         """Rows V with VᵀV = QᵀΓQ, Γ the covariance of the noise of all samples.
 
         Σ q(t) e(t) = Σ (Σ_j ψ_j q(s + j)) ε(s): the impulse responses ψ of 1 / a(q) run backwards.
         """
         longest = max(map(_memory, self.a))
-        padded = np.concatenate([Q[::-1], np.zeros((longest, *Q.shape[1:]))])
+        padded = np.concatenate([Q.numpy()[::-1], np.zeros((longest, *Q.shape[1:]))])
         for o, a in enumerate(self.a):
             if len(a) > 1:
                 padded[:, o] = scipy.signal.lfilter([1.0], a, padded[:, o], axis=0)
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        return np.einsum("ok,toc->tkc", root, padded).reshape(-1, Q.shape[2])
+        rows = np.einsum("ok,toc->tkc", root, padded).reshape(-1, Q.shape[2])
+        return torch.as_tensor(rows)
 
 
 def colours(spectra: Spectra) -> tuple[tuple[Array, ...], Float[Array, " ny"]]:
