@@ -14,13 +14,9 @@ from lfrtorch._support.tables import quantity
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.analysis.trim import Trim
 from lfrtorch.data.records import Channel
+from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.held import integrating_states
-from lfrtorch.engine.operating_point import (
-    double,
-    equilibrium,
-    linearised_at,
-    resting_input,
-)
+from lfrtorch.engine.operating_point import double, equilibrium, linearised_at, resting_input
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.model import Model
 
@@ -62,12 +58,11 @@ def linearise(
         ([0.5], True)
         >>> system = local.to_scipy()
     """
-    cell, scaler = double(model.lfr.cell), model.scaler
+    scaler = model.scaler
     if isinstance(u, Trim):
         u, x = u.u, u.x if x is None else x
-    u0 = scaler.u_offset if u is None else vector("u", u, cell.nu, "the model has {} input(s)")
-    v: Tensor = torch.as_tensor((u0 - scaler.u_offset) / scaler.u_scale)
-    if x is None:
+    cell, u0, v, found = about(model, u, x)
+    if found is None:
         found = equilibrium(cell, v)
         integrates = found is None and bool(integrating_states(cell).any())
         still = resting_input(cell, v) if integrates else None
@@ -76,13 +71,22 @@ def linearise(
             u0 = scaler.u_offset + scaler.u_scale * still.numpy()
         if found is None:
             raise InputError(_no_rest(model, u0, still))
-    else:
-        found = torch.as_tensor(vector("x", x, cell.nx, "the model has {} states"))
     with torch.no_grad():
         y0 = scaler.restore_y(cell(v, found)[0].numpy())
     outside, at = model.outside(np.asarray(u0), found.numpy()), linearised_at(cell, v, found)
-    about = {"u_offset": np.array(u0), "y_offset": y0, "x_offset": found.numpy()}
-    return LinearModel.of(model, at, outside=outside, **about)
+    known = {"u_offset": np.array(u0), "y_offset": y0, "x_offset": found.numpy()}
+    return LinearModel.of(model, at, outside=outside, **known)
+
+
+def about(
+    model: Model, u: ArrayLike | None, x: ArrayLike | None
+) -> tuple[LFRCell, Array, Tensor, Tensor | None]:
+    """The cell of a model, a given input or the offsets, the same normalised, and a given state."""
+    cell, s = double(model.lfr.cell), model.scaler
+    u0 = s.u_offset if u is None else vector("u", u, cell.nu, "the model has {} input(s)")
+    given = None if x is None else vector("x", x, cell.nx, "the model has {} states")
+    v = torch.as_tensor((u0 - s.u_offset) / s.u_scale)
+    return cell, u0, v, None if given is None else torch.as_tensor(given)
 
 
 def linear_part(model: Model) -> LinearModel:

@@ -21,11 +21,11 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.analysis.linearisation import vector
+from lfrtorch.analysis.linearisation import about
 from lfrtorch.data.records import Record, as_records
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import static_slope
-from lfrtorch.engine.operating_point import double, equilibrium
+from lfrtorch.engine.operating_point import equilibrium
 from lfrtorch.maps.mean_slopes import Neurons
 from lfrtorch.model.model import Model
 
@@ -196,7 +196,7 @@ def lpv(
         >>> form.A.shape, bool(np.isfinite(form.bounds).all())
         ((2, 1, 1), True)
     """
-    cell, s = double(model.lfr.cell), model.scaler
+    (cell, u0, v0, x0), s = about(model, u, x), model.scaler
     neurons = cell.map.neurons
     if schedule not in (None, "neurons", "map"):
         raise InputError(f"schedule is {schedule!r}; give 'neurons' or 'map'.")
@@ -205,11 +205,7 @@ def lpv(
             "schedule is 'neurons', and the static map is no network; give schedule='map'."
         )
     schedule = schedule or ("map" if neurons is None else "neurons")
-    u0 = s.u_offset if u is None else vector("u", u, cell.nu, "the model has {} input(s)")
-    v0 = torch.as_tensor((u0 - s.u_offset) / s.u_scale)
-    if x is not None:
-        x0 = torch.as_tensor(vector("x", x, cell.nx, "the model has {} states"))
-    elif (x0 := equilibrium(cell, v0)) is None:
+    if x0 is None and (x0 := equilibrium(cell, v0)) is None:
         x0 = v0.new_zeros(cell.nx)
     with torch.no_grad():
         y0, x_next0 = (each.numpy() for each in cell(v0, x0))
@@ -272,6 +268,3 @@ def _left_over(
     power = np.sum(zeta**2, axis=1, keepdims=True)
     along = np.divide(zeta, power, out=np.zeros_like(zeta), where=power > 0)
     return error[:, :, None] * along[:, None, :]
-
-
-__all__ = ["LPV", "lpv"]

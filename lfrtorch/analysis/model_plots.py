@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.drawing import (
     LINEAR,
     NL_LFR,
@@ -24,7 +25,7 @@ from lfrtorch._support.drawing import (
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import percent
 from lfrtorch._support.types import Array
-from lfrtorch.analysis.canonical_form import nearest_affine, whitening
+from lfrtorch.analysis.canonical_form import nearest_affine
 from lfrtorch.analysis.linearisation import linear_part, linearise
 from lfrtorch.data.metrics import rms
 from lfrtorch.data.records import Record, as_records
@@ -32,6 +33,7 @@ from lfrtorch.engine.operating_point import double
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.linearised import linearise_map
 from lfrtorch.maps.static_map import StaticMap
+from lfrtorch.model.data_reach import whitening
 from lfrtorch.model.model import Model
 
 _MOST_MAPS = 4
@@ -58,8 +60,26 @@ class _Visited(NamedTuple):
     known: bool
 
 
-def model_figure(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:
-    """See :func:`lfrtorch.analysis.plot`."""
+@typed()
+def plot(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:
+    """Figure of a model: frequency responses, poles, and the nonlinearity of its static map.
+
+    Responses and poles are those of the linear part and of the model linearised at rest at the
+    inputs' offsets. The static map is drawn less the affine map that is nearest to it over the
+    data, as that belongs to the linear part: over z1, over the plane of z1 and z2, or of more z
+    along the direction in which it is the least linear.
+
+    Args:
+        model: nonlinear.
+        records: data that say where z is. Default: white noise of the rms of the training inputs.
+
+    Raises:
+        ValueError: records of other channels than the model's, or a model that diverges on them.
+
+    Example:
+        >>> figure = lfrtorch.analysis.plot(model, record)
+        >>> figure.savefig("model.png")
+    """
     systems = {"linear part": linear_part(model)}
     with suppress(InputError):  # it may have no rest at the offsets
         systems["at rest"] = linearise(model)

@@ -24,6 +24,13 @@ SLIGHT = 0.1
 """Correlations below this are 1 % of the power at most; only long records show them."""
 
 
+_LEFT = {
+    "inputs": "depends on {} still", "even": "an even nonlinearity of {} is left",
+    "odd": "an odd nonlinearity or a gain of {} is left",
+}  # fmt: skip
+"""What a test finds of an input."""
+
+
 @dataclass(frozen=True, eq=False)
 class OutputResiduals:
     """Residuals of one output in one record, in its unit.
@@ -79,10 +86,14 @@ class OutputResiduals:
 
         Those of several inputs are the least, times the number of inputs.
         """
-        groups = {"inputs": self.linear, "even": self.even, "odd": self.odd}
         return {"white": self.whiteness.p} | {
-            name: min(1.0, len(each) * min(c.p for c in each)) for name, each in groups.items()
+            name: min(1.0, len(each) * min(c.p for c in each)) for name, each in self.tests.items()
         }
+
+    @property
+    def tests(self) -> dict[str, tuple[Correlation, ...]]:
+        """Correlations with each input, by the test's name."""
+        return {"inputs": self.linear, "even": self.even, "odd": self.odd}
 
     @property
     def verdict(self) -> str:
@@ -95,16 +106,12 @@ class OutputResiduals:
         white = self.whiteness.p > LEVEL
         if not white:
             found.append(f"not white: {_where(self.whiteness)}")
-        for said, each in (
-            ("depends on {} still", self.linear),
-            ("an even nonlinearity of {} is left", self.even),
-            ("an odd nonlinearity or a gain of {} is left", self.odd),
-        ):
-            found += [
-                f"{said.format(channel.name)}: {_where(c)}"
-                for channel, c in zip(self.inputs, each, strict=True)
-                if len(each) * c.p <= LEVEL
-            ]
+        found += [
+            f"{_LEFT[name].format(channel.name)}: {_where(c)}"
+            for name, each in self.tests.items()
+            for channel, c in zip(self.inputs, each, strict=True)
+            if len(each) * c.p <= LEVEL
+        ]
         beside = ""
         if self.noise:
             beside = f"{number(self.rms / self.noise)} times the noise; "

@@ -146,7 +146,7 @@ def physical_parameters(
     low, high = known.bounds.detach().double().cpu().numpy().T
     at = np.minimum(np.abs(values - low), np.abs(values - high)) <= _AT_BOUND * scale
     if at.any():
-        listed = ", ".join(name for name, one in zip(names, at, strict=True) if one)
+        listed = ", ".join(np.array(names)[at])
         notes.append(f"at a bound, so that the standard errors mean little: {listed}.")
     return PhysicalParameters(names, units, values, errors, correlation, alone, tuple(notes))
 
@@ -170,7 +170,7 @@ def _notes(
         )
     over = errors > _TAKEN_OVER * np.where(alone > 0, alone, np.inf)
     if learned and over.any():
-        listed = ", ".join(name for name, one in zip(names, over, strict=True) if one)
+        listed = ", ".join(np.array(names)[over])
         found.append(
             f"the learned part can take the place of {listed}: give what a fit with nn=0, nx=0 "
             "has found as a number, or keep the learned part small with a ridge."

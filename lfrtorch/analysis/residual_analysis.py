@@ -15,12 +15,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.powers import near_one
 from lfrtorch._support.tables import in_lines, number, quantity, table
 from lfrtorch._support.types import Array
-from lfrtorch.analysis.correlation import (
-    autocorrelation,
-    cross_correlation,
-    lags_for,
-    whitened,
-)
+from lfrtorch.analysis.correlation import autocorrelation, cross_correlation, lags_for, whitened
 from lfrtorch.analysis.densities import Densities, noise_density, power_density
 from lfrtorch.analysis.output_residuals import ROUNDING, OutputResiduals
 from lfrtorch.data.metrics import rms
@@ -80,12 +75,14 @@ class Residuals:
             raise InputError(f"there is no record '{record}' among the residuals; give of {names}.")
         return found
 
+    @property
+    def _shown(self) -> list[OutputResiduals]:
+        kept = {id(part) for part in sorted(self.parts, key=_goodness)[:_MOST_ROWS]}
+        return [part for part in self.parts if id(part) in kept]
+
     def rows(self) -> tuple[list[str], list[list[str | int | float]]]:
         """Head and rows of the table, the parts in their order; of many those of the least fit."""
-        shown = self.parts
-        if len(shown) > _MOST_ROWS:
-            kept = {id(part) for part in sorted(shown, key=_goodness)[:_MOST_ROWS]}
-            shown = tuple(part for part in shown if id(part) in kept)
+        shown = self._shown
         known = any(part.noise is not None for part in shown)
         head = ["record", "output", "samples", "fit (%)", "rms", "bias", *["noise"] * known]
         rows = [
@@ -95,8 +92,8 @@ class Residuals:
                 len(part.error),
                 part.fit,
                 *(
-                    quantity(value, part.output.unit)
-                    for value in [part.rms, part.bias, *[part.noise] * known]
+                    quantity(v, part.output.unit)
+                    for v in [part.rms, part.bias, part.noise][: 2 + known]
                 ),
                 *(probability(p) for p in part.p.values()),
             ]
@@ -106,26 +103,15 @@ class Residuals:
 
     def sentences(self) -> list[str]:
         """A verdict for each row of the table."""
-        _, rows = self.rows()
-        shown = {(row[0], row[1]) for row in rows}
-        return [
-            f"{part.record}, {part.output.name}: {part.verdict}."
-            for part in self.parts
-            if (part.record, part.output.name) in shown
-        ]
+        return [f"{part.record}, {part.output.name}: {part.verdict}." for part in self._shown]
 
     def entries(self) -> dict[str, dict[str, Any]]:
         """The numbers by record and output, for ``metrics.json``."""
         found: dict[str, dict[str, Any]] = {}
+        names = "fit", "rms", "bias", "noise", "p", "verdict"
         for part in self.parts:
-            found.setdefault(part.record, {})[part.output.name] = {
-                "fit": part.fit,
-                "rms": part.rms,
-                "bias": part.bias,
-                "noise": part.noise,
-                "p": part.p,
-                "verdict": part.verdict,
-            }
+            entry = {name: getattr(part, name) for name in names}
+            found.setdefault(part.record, {})[part.output.name] = entry
         return found
 
     def __str__(self) -> str:
