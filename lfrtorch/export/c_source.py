@@ -63,7 +63,7 @@ def c_source(
         ['#include "actuator.h"', '#include <math.h>']
     """
     e = equations(model, name)
-    known: dict[str, Any] = {"ts": repr(1.0 / e.fs), "about": _comment(e.about())}
+    known: dict[str, Any] = {"ts": repr(1.0 / e.fs), "about": [*map(_plain, e.about())]}
     known |= {"constant": _constant, "pairs": _pairs, "slopes": _slopes}
     known["roots"] = observer_equations(model, observer).roots
     header, source = (e.rendered(file, _C, **known) for file in ("model.h", "model.c"))
@@ -122,11 +122,6 @@ def _braces(rows: Sequence[Sequence[str]]) -> str:
             line += f" {number},"
         lines.append(line)
     return "\n".join(["{", *lines, "}"])
-
-
-def _comment(lines: Sequence[str]) -> str:
-    """Turn lines into a comment."""
-    return "\n".join(["/*", *(f" * {_plain(line)}".rstrip() for line in lines), " */"])
 
 
 def _plain(text: str) -> str:

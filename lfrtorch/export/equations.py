@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import keyword
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any, NamedTuple, Protocol
@@ -99,24 +99,8 @@ class Equations:
         """What a reader of the export should know: equations, channels, units, offsets, rate."""
         # ``place`` is how its language writes a channel: letter {0}, number from 0 {1} and from 1
         # {2}.
-        static, w, bw, kind = [], "", "", "linear"
-        if self.map.nw:
-            meaning = printable(self.map.meaning)
-            static = ["z      = Cz x + Dzu v", f"w      = f(z) = {meaning}"]
-            w, bw, kind = " + Dyw w", " + Bw w", "nonlinear"
-        return [
-            f"{self.name}: a {kind} state-space model in physical units, sampled at "
-            f"{self.fs:g} Hz,",
-            f"by lfrtorch {version('lfrtorch')}.",
-            "",
-            "    v      = u - u_offset",
-            *(f"    {line}" for line in static),
-            f"    y      = Cy x + Dyu v{w} + y_offset",
-            f"    x_next = A x + Bu v{bw}",
-            "",
-            *_signals(place, "u", self.inputs, self.u_offset, self.reach and self.reach.u),
-            *_signals(place, "y", self.outputs, self.y_offset, self.reach and self.reach.y),
-        ]
+        known = {"place": place, "version": version("lfrtorch"), "printable": printable}
+        return self.rendered("about.txt", **known).splitlines()
 
     def description(self) -> dict[str, Any]:
         """Name, rate, state at rest and channels, for JSON."""
@@ -172,22 +156,6 @@ class Equations:
         known = {"NAME": self.name.upper(), "rest": self.x_rest.size, **self.sizes, **vars(self)}
         known |= {n: getattr(self, n) for n in ("arrays", "distance", "feedthrough")}
         return environment.get_template(template).render(known | {"statements": written} | more)
-
-
-def _signals(
-    place: str, letter: str, channels: Sequence[Channel], offset: Array, ends: Array | None
-) -> list[str]:
-    """Describe each channel on a line: place, name, unit, operating point and range in the data."""
-    lines = [
-        f"{place.format(letter, i, i + 1)}: {channel}, operating point {number:.6g}"
-        for i, (channel, number) in enumerate(zip(channels, offset, strict=True))
-    ]
-    if ends is not None:
-        lines = [
-            f"{line}, {low:.6g} to {high:.6g} in the data"
-            for line, (low, high) in zip(lines, ends, strict=True)
-        ]
-    return [printable(line) for line in lines]
 
 
 def printable(text: str) -> str:

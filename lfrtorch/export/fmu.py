@@ -66,12 +66,12 @@ def fmu(model: Model | LinearModel, name: str, version: int) -> bytes:
     known["states"] = [first + nu + ny + i for i in range(e.sizes["nx"])]
     files = {f"{name}.h": header, f"{name}.c": source}
     files[f"{name}_fmu.c"] = e.rendered("fmu.c", **known)
-    archive, machine = io.BytesIO(), "linux64" if version == 2 else "x86_64-linux"
-    with ZipFile(archive, "w", ZIP_DEFLATED) as made:
-        made.writestr(f"binaries/{machine}/{name}.so", _compiled(files, name))
+    machine, binary = "linux64" if version == 2 else "x86_64-linux", _compiled(files, name)
+    with ZipFile(archive := io.BytesIO(), "w", ZIP_DEFLATED) as made:
         made.writestr("modelDescription.xml", e.rendered("fmu.xml", **known))
         if version == 3:
             made.writestr("sources/buildDescription.xml", e.rendered("fmu_build.xml"))
+        made.writestr(f"binaries/{machine}/{name}.so", binary)
         for file, text in files.items():
             made.writestr(f"sources/{file}", text)
     return archive.getvalue()

@@ -1,5 +1,9 @@
 {% set K, G = "K" in roots, "G" in roots %}
-{{ about }}
+/*
+{% for line in about %}
+{{ (" * " ~ line).rstrip() }}
+{% endfor %}
+ */
 #ifndef {{ NAME }}_H
 #define {{ NAME }}_H
 
