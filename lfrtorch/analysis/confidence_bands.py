@@ -203,7 +203,7 @@ class Uncertainty:
             >>> bool(pole.frequency > 0), bool(pole.frequency_std > 0)
             (True, True)
         """
-        return self._known(linear_part(self.model), lambda W: (W.A, W.Bu, W.Cy, W.Dyu))
+        return self._with_covariance(linear_part(self.model), lambda W: (W.A, W.Bu, W.Cy, W.Dyu))
 
     def linearise(self, u: ArrayLike | None = None) -> LinearModel:
         """The model about its rest, as ``lfrtorch.analysis.linearise``, with its covariance.
@@ -224,9 +224,9 @@ class Uncertainty:
         """
         found = linearise(self.model, u)
         assert found.x_offset is not None
-        return self._known(found, _at_rest(self.model, found.u_offset, found.x_offset))
+        return self._with_covariance(found, _at_rest(self.model, found.u_offset, found.x_offset))
 
-    def _known(
+    def _with_covariance(
         self, linear: LinearModel, matrices: Callable[[Weights], Sequence[Tensor]]
     ) -> LinearModel:
         """A linear model with the covariance of its matrices, which are functions of θ."""
@@ -325,10 +325,10 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
             total.fold(own.coloured(Q))
     # A direction that the data do not tell has the variance of the least one that they do.
     untold = torch.diag(float(np.trace(colour.covariance)) / cell.ny * (1.0 - seen.square()))
-    spread_of, rank, zs, variances = root(untold + total.G), int((seen == 1).sum()), [], []
+    scatter, rank, zs, variances = root(untold + total.G), int((seen == 1).sum()), [], []
     for along in every:
         scored = slice(along.record.skip, None)
-        parts = [(Q[..., : len(kept)] @ spread_of).square().sum(-1) for _, Q in along.blocks()]
+        parts = [(Q[..., : len(kept)] @ scatter).square().sum(-1) for _, Q in along.blocks()]
         if not along.group.spectral:
             # As if the sample were not among those that the model is fitted to.
             taken = [Q.square().sum(-1) for _, Q, _ in along.weighted()]
@@ -342,12 +342,12 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
         records=tuple(record.name for record in listed),
         samples=sum(record.samples - record.skip for record in listed),
         kept=kept,
-        factor=W @ spread_of,
+        factor=W @ scatter,
         rank=rank,
         noise=deviations * model.scaler.y_scale,
         relative=np.sqrt(variance).mean(axis=0) / np.maximum(y.std(axis=0), 1e-300),
         doubts=_doubts(every, model, sizes, rank, left)
-        + _clipped(every, spread_of, torch.as_tensor(deviations)),
+        + _clipped(every, scatter, torch.as_tensor(deviations)),
         colour=colour,
         reach=TrainingReach.of(np.concatenate(zs), variance),
     )
@@ -509,10 +509,10 @@ def _doubts(
 
 
 def _clipped(
-    every: Sequence[Gradients], spread_of: Float[Tensor, "K m"], noise: Float[Tensor, " ny"]
+    every: Sequence[Gradients], scatter: Float[Tensor, "K m"], noise: Float[Tensor, " ny"]
 ) -> tuple[str, ...]:
     """How far noise that the limits of a sensor cut off has shifted the fit, if that is far."""
-    K, total = len(spread_of), spread_of.new_zeros(len(spread_of))
+    K, total = len(scatter), scatter.new_zeros(len(scatter))
     for along in every:
         if along.group.limits is None or not noise.all():
             continue
@@ -526,7 +526,7 @@ def _clipped(
         mean *= torch.as_tensor(along.record.factors).square()
         for time, rows in along.blocks():
             total += torch.einsum("tok,to->k", rows[..., :K], mean[time])
-    shift = torch.linalg.pinv(spread_of, rtol=_TRUNCATION) @ total
+    shift = torch.linalg.pinv(scatter, rtol=_TRUNCATION) @ total
     errors = float(shift.square().mean().sqrt())
     if errors < _SHIFTED:
         return ()

@@ -48,8 +48,8 @@ class Gradients:
         records = [model.scaler.normalise(record)]
         errors = SimulationErrors(model.lfr.cell, records, solve_initial_states=not fitted)
         self.record, self.kept = record, kept
-        self.basis = torch.eye(len(kept), dtype=torch.float64)
-        """Directions of the kept parameters, one for each column of what ``blocks`` yields."""
+        self.basis: Tensor | None = None
+        """Directions (K, m) of the kept parameters, whose columns ``blocks`` yields instead."""
         _, (self.trajectory,) = errors.evaluate(errors.first_theta())
         self.group: RecordGroup = errors.groups[0].counted(self.trajectory.y)
         periodic, self.estimated = self.group.start.periodic, self.group.start.fitted
@@ -83,7 +83,10 @@ class Gradients:
         """Samples and their rows; nx columns of an estimated start state follow the others."""
         K = len(self.kept)
         for time, rows in self._held or self._moved():
-            yield time, torch.cat([rows[..., :K] @ self.basis, rows[..., K:]], -1)
+            if self.basis is None:
+                yield time, rows
+            else:
+                yield time, torch.cat([rows[..., :K] @ self.basis, rows[..., K:]], -1)
 
     def _moved(self) -> Iterator[tuple[slice, Float[Tensor, "B ny C"]]]:
         """Samples and their rows by the kept parameters, which move the start state, too."""
@@ -99,7 +102,7 @@ class Gradients:
 
     def weighted(self) -> Iterator[tuple[slice, Float[Tensor, "m ny K"], Float[Tensor, "m ny"]]]:
         """Those columns and the errors, weighted as in a fit; real, then imaginary if by line."""
-        group, m = self.group, self.basis.shape[1]
+        group, m = self.group, len(self.kept) if self.basis is None else self.basis.shape[1]
         for time, rows in self.blocks():
             part, errors = rows[None, ..., :m], self.errors[None, time]
             yield time, group.weigh(part, time=time)[0], group.weigh(errors, time=time)[0]
