@@ -70,7 +70,7 @@ def run(command: str, task: Callable[[Any], object]) -> None:
 
 
 def _nothing(_: Any) -> None:
-    """Where Hydra prints its help and ends."""
+    """Do nothing: Hydra prints its help and ends before."""
 
 
 def config_name(command: str) -> str:

@@ -56,7 +56,7 @@ def in_full(command: str, given: Sequence[str]) -> list[str]:
 def of_newest(word: str) -> str:
     """The word; if it names a folder of runs for a model, the newest of these in its place."""
     name, _, value = word.partition("=")
-    if name not in ("checkpoint", "init_from") or not read(quoted(word)):
+    if name not in ("checkpoint", "init_from"):
         return word
     folder = expanded(str(parsed(word).value()))
     runs = [run for run in folder.glob("*") if _DATE.fullmatch(run.name) and _has_model(run)]
@@ -126,10 +126,9 @@ def _plain_or_quoted(option: str, path: str) -> str:
 def _listed(word: str, *, several: bool) -> str:
     """Names of columns without brackets as a list; several of them are runs if there are some."""
     name, _, value = quoted(word).partition("=")
-    found = read(f"{name}={value}")
-    if name not in _LISTS or not found:
+    if name not in _LISTS:
         return word
-    given = found.value()
+    given = parsed(word).value()
     if isinstance(given, ChoiceSweep):
         single = given.simple_form and not several
     else:

@@ -36,7 +36,7 @@ class PlainSettings:
     )
     nw: Size = setting(1, 'its outputs, or ``"auto"``.', least=1, word="auto")
     nn: Size = setting(15, 'neurons of ``static="network"``, or ``"auto"``.', least=1, word="auto")
-    activation: str = setting(
+    activation: Literal["tanh", "sigmoid", "relu", "rbf", "softplus"] = setting(
         "tanh",
         'their function: ``"tanh"``, ``"sigmoid"``, ``"relu"``, ``"rbf"`` or ``"softplus"``.',
     )
@@ -63,7 +63,7 @@ class PlainSettings:
         "whether it acts on the output at once; False for data under feedback without a delay. "
         "The linear model has none then, either.",
     )
-    structure: str = setting(
+    structure: Literal["free", "wiener", "hammerstein", "wiener_hammerstein", "parallel"] = setting(
         "free",
         'of which blocks the model is made, and a fit keeps to: ``"wiener"``, ``"hammerstein"``, '
         '``"wiener_hammerstein"`` or ``"parallel"``, see :func:`lfrtorch.initialise`.',

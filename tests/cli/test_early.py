@@ -40,6 +40,8 @@ def file(tmp_path: Path) -> Path:
         (["nx=3", "fs=null"], "data: the sampling frequency of 'x.csv' is not known; give fs=HZ"),
         (["nx=3", "fs=-1"], "data: fs is -1; give a positive number"),
         (["nx=3", "noise=both"], "noise is 'both'; give 'output' or 'innovation'."),
+        (["nx=3", "activation=swish"], "activation is 'swish'; give 'tanh', 'sigmoid', 'relu', 'r"),
+        (["nx=3", "structure=serial"], "structure is 'serial'; give 'free', 'wiener', 'hammer"),
         (["nx=3", "structure=wiener", "modes=1"], "and modes is 1: its w drives no states; give"),
         (["nx=3", "dtype=float16"], "dtype is float16; give float64 or float32."),
         (["resume=runs/nowhere"], "resume is 'runs/nowhere', which is not the folder of a run"),
