@@ -112,7 +112,7 @@ def load(
             "selection_rms: none may be the training or simulated test realisation\n"
             f"(offsets 0 and {_TEST_OFFSET}); use for example 1000."
         )
-    folder = _official_folder(root, download)
+    found = _official(root, download)
     estimation: dict[str, Any] = {"samples": samples, "noise_rms": noise_rms}
     chosen = [
         _realisation(
@@ -133,7 +133,7 @@ def load(
         ],
         validation=[chosen[0]],
         selection=chosen[1:],
-        tests=_tests(folder, seed + _TEST_OFFSET),
+        tests=_tests(found, seed + _TEST_OFFSET),
         noise_rms=noise_rms,
         seed=seed,
         published=official.published("boucwen"),
@@ -327,55 +327,45 @@ def _realisation(
     return _record(u[::_RATIO], y, name=name, start="periodic", source="simulated")
 
 
-def _tests(folder: Path, seed: int) -> list[Record]:
+def _tests(found: dict[str, list[Array]], seed: int) -> list[Record]:
     """Tests multisine and sweep; simulated without their files."""
-    found = _read_official(folder, "multisine")
-    if found is None:
-        multisine = _realisation("multisine", seed, samples=_PERIOD, rms=50.0, noise_rms=0.0)
+    if "multisine" in found:
+        u, y = found["multisine"]
+        multisine = _record(u, y, name="multisine", start="periodic", source="official")
     else:
-        multisine = _record(*found, name="multisine", start="periodic", source="official")
-    found, source = _read_official(folder, "sinesweep"), "official"
-    if found is None:
-        u = sweep()
-        found, source = (u[::_RATIO], simulate(u, factors=(_RATIO,))), "simulated"
-    return [multisine, _record(*found, name="sweep", start="zero", skip=2000, source=source)]
+        multisine = _realisation("multisine", seed, samples=_PERIOD, rms=50.0, noise_rms=0.0)
+    source = "official" if "sinesweep" in found else "simulated"
+    if source == "official":
+        u, y = found["sinesweep"]
+    else:
+        force = sweep()
+        u, y = force[::_RATIO], simulate(force, factors=(_RATIO,))
+    return [multisine, _record(u, y, name="sweep", start="zero", skip=2000, source=source)]
 
 
 def _record(u: Array, y: Array, **kwargs: Any) -> Record:
     return official.record(u, y, {"u": "N"}, {"y": "m"}, fs=_FS, **kwargs)
 
 
-def _official_folder(root: str | Path | None, download: bool) -> Path:
-    """Folder of the official test files, which must exist below a given ``root``."""
+def _official(root: str | Path | None, download: bool) -> dict[str, list[Array]]:
+    """Read input (N) and output (m), (samples,) each, of the tests whose files exist."""
     if download:
-        first = f"{_FILES}/uval_multisine.mat"
-        return official.find(root, first, _LOADER, download=True).parent
-    if root is None:
-        return official.folder(None) / _FILES
-    folder = official.folder(root) / _FILES
-    if not any(path.is_file() for test in _TESTS for path in _pair(folder, test)):
+        official.find(root, f"{_FILES}/uval_multisine.mat", _LOADER, download=True)
+    found: dict[str, list[Array]] = {}
+    for test, samples in _TESTS.items():
+        paths = [official.folder(root) / _FILES / f"{letter}val_{test}.mat" for letter in "uy"]
+        missing = [path for path in paths if not path.is_file()]
+        if len(missing) == 1:
+            raise FileNotFoundError(
+                f"'{missing[0]}' is missing although its partner is there; put it back, or remove "
+                "both to have the test simulated."
+            )
+        if not missing:
+            found[test] = [official.read_arrays(p, {p.stem: (samples,)})[p.stem] for p in paths]
+    if root is not None and not found:
         raise FileNotFoundError(
             f"no Bouc-Wen test files in '{root}': expected '{_FILES}/uval_multisine.mat', "
             "yval_multisine.mat, uval_sinesweep.mat and yval_sinesweep.mat below it.\nGive the "
             "folder that holds 'BoucWen', or leave root out to simulate the tests."
         )
-    return folder
-
-
-def _pair(folder: Path, test: str) -> list[Path]:
-    return [folder / f"{letter}val_{test}.mat" for letter in "uy"]
-
-
-def _read_official(folder: Path, test: str) -> tuple[Array, Array] | None:
-    """Read input (N) and output (m) of a test, (samples,) each; ``None`` if neither file exists."""
-    paths = _pair(folder, test)
-    missing = [path for path in paths if not path.is_file()]
-    if missing == paths:
-        return None
-    if missing:
-        raise FileNotFoundError(
-            f"'{missing[0]}' is missing although its partner is there; put it back, or remove "
-            "both to have the test simulated."
-        )
-    u, y = (official.read_arrays(p, {p.stem: (_TESTS[test],)})[p.stem] for p in paths)
-    return u, y
+    return found

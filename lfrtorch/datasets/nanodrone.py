@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -182,12 +182,10 @@ def _arrays(path: Path) -> tuple[Array, Array, Array]:
 
 def _released(path: Path) -> tuple[Array, Array, float]:
     """Read u, y and fs from a file of the release."""
-    with path.open() as file:
-        names = file.readline().strip().split(",")
-        table = np.genfromtxt(file, delimiter=",", dtype=np.float64).reshape(-1, len(names))
+    table: Any = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, dtype=np.float64))
 
     def columns(*wanted: str) -> Array:
-        return table[:, [names.index(name) for name in wanted]]
+        return np.column_stack([table[name] for name in wanted])
 
     quaternions = columns("qx", "qy", "qz", "qw")
     attitude = scipy.spatial.transform.Rotation.from_quat(quaternions).as_euler("xyz")
