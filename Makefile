@@ -7,7 +7,7 @@ PARTIAL := $(VENV)/.partial
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-all test-machines test-min test-latest torture oracle mutants coverage check bench first-try reproduce docs docs-links audit dist clean
+.PHONY: help setup run test test-all test-machines slow-paths test-min test-latest torture oracle mutants coverage check bench first-try reproduce docs docs-links audit dist clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -26,6 +26,10 @@ test-all: $(READY)  ## all tests, the slow ones too
 
 test-machines: $(READY)  ## tests that compute, as on other processors (ARGS="oldest newest ...")
 	@$(BIN)/python tests/machines.py $(ARGS)
+
+slow-paths: $(READY)  ## fast tests without machine code and other quick ways (ARGS="tests/engine ...")
+	@kept=$$(mktemp -d) && trap 'rm -rf "$$kept"' EXIT && \
+	    LFRTORCH_SLOW_PATHS=1 NUMBA_CACHE_DIR="$$kept" $(BIN)/python -m pytest $(PARALLEL) $(ARGS)
 
 test-min: $(READY)  ## fast tests with the oldest versions of what lfrtorch needs (ARGS="--keep torch")
 	@$(BIN)/python tests/versions.py min $(ARGS)

@@ -55,6 +55,17 @@ def short_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lfrtorch.fitting.choice._budget", lambda rows: 0.0)
 
 
+@pytest.fixture
+def fast(monkeypatch: pytest.MonkeyPatch) -> Callable[[bool], None]:
+    """Quick ways, in a run without them as well; ``fast(False)`` turns them off."""
+
+    def turn(on: bool) -> None:
+        monkeypatch.setenv("LFRTORCH_SLOW_PATHS", "" if on else "1")
+
+    turn(True)
+    return turn
+
+
 @pytest.fixture(scope="session")
 def benchmark_root() -> Path:
     """Folder of the nonlinear benchmarks, one subfolder a benchmark."""

@@ -13,7 +13,7 @@ from lfrtorch.least_squares.problem import Problem
 from lfrtorch.maps.activations import ACTIVATIONS
 from lfrtorch.model.model import Model
 
-pytestmark = pytest.mark.numeric
+pytestmark = [pytest.mark.numeric, pytest.mark.usefixtures("fast")]
 
 DEVICES = ["torch", *(["cuda"] if torch.cuda.is_available() else [])]
 

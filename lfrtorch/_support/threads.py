@@ -164,13 +164,21 @@ if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
+SLOW_PATHS = "LFRTORCH_SLOW_PATHS"
+"""Environment variable that turns all quick ways off, to check their results by the plain ones."""
+
 COMPILED_ON = {"cpu"}
 """Devices with compiled kernels; others run in torch, parallel in time."""
 
 
+def fast_paths() -> bool:
+    """Whether there are quick ways: machine code, a search from states close by, kept results."""
+    return not os.environ.get(SLOW_PATHS)
+
+
 def has_kernels(tensor: Tensor) -> bool:
-    """Tell if the tensor's device has compiled kernels."""
-    return tensor.device.type in COMPILED_ON
+    """Whether compiled kernels serve the tensor's device."""
+    return tensor.device.type in COMPILED_ON and fast_paths()
 
 
 def to_numpy(tensor: Tensor) -> NDArray:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.threads import fast_paths
 from lfrtorch.data.records import Start, check_start
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.differentiable import Simulation
@@ -140,9 +141,20 @@ class LFR(nn.Module):
         self.cell.check_signals(u, x0)
         if x0 is None:
             x0 = u.new_zeros(len(u), self.cell.nx)
+        if start != "periodic" and not fast_paths():
+            return self._stepped(u, x0)
         weights = self.cell.parameters()
         y, end, *_ = Simulation.apply(self.cell, start == "periodic", u, x0, *weights)
         return y, end
+
+    def _stepped(self, u: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Output and last state by torch alone, sample by sample."""
+        self.cell.check()
+        outputs = []
+        for u_k in u.unbind(1):
+            y, x = self.cell(u_k, x)
+            outputs.append(y)
+        return torch.stack(outputs, dim=1), x
 
     @staticmethod
     def _check_start(start: Start) -> None:

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from lfrtorch._support.threads import fast_paths
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linear_recurrence import linear_recurrence
 from lfrtorch.engine.linearised import linearise, spectral_radius
@@ -50,7 +51,11 @@ def newton_states(
     """
     W = model.weights()
     tolerance = _UPDATE_ROUNDING * torch.finfo(u.dtype).eps ** 0.5
-    x = x0.unsqueeze(1).expand(-1, u.shape[1] + 1, -1) if guess is None else guess
+    x = (
+        x0.unsqueeze(1).expand(-1, u.shape[1] + 1, -1)
+        if guess is None or not fast_paths()
+        else guess
+    )
     driven = u @ W.Bu.mT
     transition, found = W.A, torch.zeros(len(u), dtype=torch.bool)  # before the first iteration
     for _ in range(MAX_NEWTON):

@@ -32,7 +32,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lfrtorch._support.threads import spread_loop, workers
+from lfrtorch._support.threads import fast_paths, spread_loop, workers
 from lfrtorch._support.types import Integers
 from lfrtorch.engine.blocked_kernel import blocked_rows
 from lfrtorch.engine.feedback_recurrence import states, transition
@@ -322,7 +322,7 @@ class Linearisation:
     def _few(self) -> bool:
         """Tell if samples are few enough to be linearised at once."""
         R, T = self.u.shape[:2]
-        return (KEPT if self._compiled else PASS) >= R * T
+        return fast_paths() and (KEPT if self._compiled else PASS) >= R * T
 
     def _block(self, records: slice, time: slice) -> _Block:
         whole = self._whole

@@ -78,8 +78,9 @@ class Layout:
         state_covariance: Tensor,
     ) -> None:
         self.state_covariance = state_covariance
-        self.sizes, self.static, self.code = sizes, static, static.code
-        self.compiled = self.code is not None and has_kernels(state_covariance)
+        self.sizes, self.static = sizes, static
+        self.code = static.code if has_kernels(state_covariance) else None
+        self.compiled = self.code is not None
         """Whether machine code simulates the model on its device."""
         self._parameters = parameters
         self.places, end = _places(sizes)

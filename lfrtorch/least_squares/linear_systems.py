@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from scipy.sparse.linalg import ArpackError, eigsh
 from torch import Tensor
 
-from lfrtorch._support.threads import spread, to_float64
+from lfrtorch._support.threads import has_kernels, spread, to_float64
 from lfrtorch._support.types import Array
 
 MERGED = 16
@@ -153,7 +153,7 @@ class ReducedSystem:
 
 def largest_eigenvalue(G: Float[Tensor, "P P"]) -> float:
     """Of a symmetric matrix; of a large one by a Krylov subspace, some thirty products with it."""
-    if len(G) < KRYLOV or G.device.type != "cpu":
+    if len(G) < KRYLOV or not has_kernels(G):
         return float(torch.linalg.eigvalsh(G)[-1])
     start = np.ones(len(G), G.numpy().dtype)  # ARPACK's own would be random
     try:
@@ -213,7 +213,7 @@ class GramAccumulator:
         """Add rows."""
         n = rows.shape[1]
         pieces = _pieces(rows)
-        if rows.device.type != "cpu" or n < WIDE or pieces > 1:
+        if not has_kernels(rows) or n < WIDE or pieces > 1:
             self.add(*(_of_pieces(_square, rows) if pieces > 1 else [product(rows.mT, rows)]))
             return
         if not self._parts:
@@ -271,7 +271,7 @@ def _of_pieces(
 
 
 def _pieces(rows: Tensor) -> int:
-    most = PIECES if rows.device.type == "cpu" else 1
+    most = PIECES if has_kernels(rows) else 1
     return max(1, min(most, len(rows) // (TALL * rows.shape[1])))
 
 
@@ -296,7 +296,7 @@ def _add_panels(job: int, edges: Array, rows: Array, G: Array) -> None:
 
 def product(left: Float[Tensor, "m k"], right: Float[Tensor, "k n"]) -> Float[Tensor, "m n"]:
     """left @ right, by numpy on the CPU: faster if k is large, and one triangle of a square."""
-    if left.device.type != "cpu":
+    if not has_kernels(left):
         return left @ right
     with np.errstate(over="ignore", invalid="ignore"):  # such a system has no scale
         return torch.from_numpy(left.numpy() @ right.numpy())

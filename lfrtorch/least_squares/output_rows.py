@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lfrtorch._support.threads import spread
+from lfrtorch._support.threads import has_kernels, spread
 from lfrtorch.engine.sensitivity import Linearisation, Rows, fixed_point, output_jacobian
 from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator
 from lfrtorch.least_squares.output_columns import OutputColumns
@@ -260,7 +260,7 @@ def _product(
     """The matrix of each record times its vector, the records shared by the threads."""
     if len(matrices) == 1:
         return torch.mv(matrices[0], vectors[0]).unsqueeze(0)
-    if len(matrices) > MANY and matrices.device.type == "cpu":
+    if len(matrices) > MANY and has_kernels(matrices):
         return torch.from_numpy(np.matmul(matrices.numpy(), vectors.numpy()[..., None])[..., 0])
     out = vectors.new_empty(matrices.shape[:2])
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lfrtorch._support.threads import has_kernels
+from lfrtorch._support.threads import fast_paths, has_kernels
 from lfrtorch._support.types import Array
 from lfrtorch.data.records import NormalisedRecord
 from lfrtorch.engine.cell import LFRCell
@@ -132,7 +132,7 @@ class SimulationErrors:
         """The trajectory of each group at θ, from the states near it."""
         W, found = self.parameters.weights(theta), []
         for i, group in enumerate(self.groups):
-            states = None if near is None else near[i].x
+            states = near[i].x if near is not None and fast_paths() else None
             x0 = group.x0
             if group.start_weight is not None and self._solved:
                 first = None if states is None else states[:, 0]

@@ -17,6 +17,7 @@ from lfrtorch import InputError
 from lfrtorch.engine.lfr import LFR
 
 pytestmark = [
+    pytest.mark.usefixtures("fast"),
     pytest.mark.numeric,
     # torch's own use of it, in its forward mode
     pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning"),

@@ -1,5 +1,6 @@
 """Recurrences without F(k) are those with it, in machine code and in torch."""
 
+from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -8,7 +9,6 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lfrtorch._support import threads
 from lfrtorch.engine import feedback_recurrence
 from lfrtorch.engine.feedback_recurrence import states, transition
 from lfrtorch.engine.linearised import linearise_at
@@ -17,10 +17,9 @@ pytestmark = pytest.mark.numeric
 
 
 @pytest.fixture(params=["compiled", "torch"], autouse=True)
-def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
+def way(request: pytest.FixtureRequest, fast: Callable[[bool], None]):
     """On the CPU, and as on any other device."""
-    if request.param == "torch":
-        monkeypatch.setattr(threads, "COMPILED_ON", set())
+    fast(request.param == "compiled")
 
 
 def weights(nx: int, nz: int, nw: int, dtype: torch.dtype) -> Any:

@@ -37,7 +37,7 @@ def test_estimated_initial_state_is_the_one_that_made_the_output():
 
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 @pytest.mark.parametrize("sizes", [(1, 1, 2, 0, 0, 0), (2, 2, 3, 2, 2, 4), (1, 2, 4, 1, 2, 3)])
-def test_machine_code_and_torch_find_the_same_initial_states(sizes, noise: float, monkeypatch):
+def test_machine_code_and_torch_find_the_same_initial_states(sizes, noise: float, fast):
     """From rest and from near, with and without the prior that few samples need."""
     nu, ny, nx, nz, nw, nn = sizes
     cell, u = random_cell(nu, ny, nx, nz, nw, nn), normal(5, 40, nu)
@@ -49,7 +49,7 @@ def test_machine_code_and_torch_find_the_same_initial_states(sizes, noise: float
     ways.append(lambda cell, u, y, weight: estimated_start(cell, u, y, weight, near))
     near = normal(5, nx, seed=1)
     found = [way(cell, u, y, weight) for way in ways]
-    monkeypatch.setattr(threads, "COMPILED_ON", set())
+    fast(False)
     # Both end the search where a step gains 1e-8 of the cost: errors of 1e-4 in the state.
     for way, by_code in zip(ways, found, strict=True):
         assert_close(way(cell, u, y, weight), by_code, rtol=0, atol=1e-4)
@@ -72,13 +72,13 @@ def test_the_search_from_the_state_of_a_model_close_by_is_short_and_ends_at_the_
     monkeypatch.setattr(threads, "COMPILED_ON", set())
     cell, u = random_cell(1, 1, 3, 2, 2, 4), normal(2, 60, 1)
     y = simulate(cell, u, normal(2, 3, seed=1)).y + 0.1 * normal(2, 60, 1, seed=2)
-    weight, factors, factor = torch.ones_like(y), [], initial_state._factor
+    weight, factors, rows = torch.ones_like(y), [], Linearisation.rows
     near = estimated_start(cell, u, y, weight)
     with torch.no_grad():
         for parameter in cell.parameters():
             parameter.mul_(1.0 + 1e-4)
     monkeypatch.setattr(
-        initial_state, "_factor", lambda *given: factors.append(1) or factor(*given)
+        Linearisation, "rows", lambda *given, **named: factors.append(1) or rows(*given, **named)
     )
     whole = estimated_start(cell, u, y, weight)
     searched = len(factors)
@@ -89,14 +89,14 @@ def test_the_search_from_the_state_of_a_model_close_by_is_short_and_ends_at_the_
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_samples_after_the_last_that_counts_play_no_part(compiled: bool, monkeypatch):
+def test_samples_after_the_last_that_counts_play_no_part(compiled: bool, fast):
     cell, u = random_cell(1, 1, 2, 1, 1, 3, radius=0.5), normal(1, 3000, 1)
     y = simulate(cell, u, normal(1, 2, seed=1)).y
     with torch.no_grad():
         cell.state_covariance.mul_(2.0)  # known: no simulation from rest tells it
     weight = torch.ones_like(y)
     weight[:, 20:] = 0.0
-    monkeypatch.setattr(threads, "COMPILED_ON", {"cpu"} if compiled else set())
+    fast(compiled)
     whole = estimated_start(cell, u, y, weight)
     y[:, 20:] = torch.nan
     assert torch.equal(estimated_start(cell, u, y, weight), whole)

@@ -74,6 +74,7 @@ def test_gradient_by_the_input_is_that_of_the_plain_loop():
     assert_close(gradient, expected, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.usefixtures("fast")
 def test_second_derivatives_are_refused():
     lfr = small()
     loss = lfr(normal(1, 5, 2)).square().sum()
@@ -150,6 +151,7 @@ def test_linear_case_is_dlsim():
     np.testing.assert_allclose(lfr(u).detach().numpy()[0], expected, rtol=0, atol=1e-10)
 
 
+@pytest.mark.usefixtures("fast")
 @pytest.mark.parametrize("cut", [1, 20, 39])
 def test_two_halves_with_carried_state_are_the_whole(cut: int):
     lfr, u = small(), normal(2, 40, 2)
@@ -231,6 +233,7 @@ def test_a_model_of_a_dtype_without_kernels_is_refused():
         lfr(torch.zeros(1, 5, 2).bfloat16())
 
 
+@pytest.mark.usefixtures("fast")
 @pytest.mark.parametrize("inside", [False, True], ids=["backward behind it", "backward in it"])
 def test_autocast_leaves_the_layer_in_the_dtype_of_its_weights(inside: bool):
     lfr = LFR(random_cell(2, 2, 2, 2, 1, 2, dtype=torch.float32))

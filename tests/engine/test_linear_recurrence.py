@@ -87,6 +87,7 @@ def test_views_are_read_as_they_stand(way):
     assert_same(way(F, g, s0), linear_loop(F, g, s0), 1e-12)
 
 
+@pytest.mark.usefixtures("fast")
 def test_faded_states_are_zero_and_never_denormal():
     """Again and again: after the start, and after what drives them once more."""
     F = torch.full((2, 2600, 1, 1), 0.5, dtype=torch.float64)

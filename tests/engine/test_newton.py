@@ -20,7 +20,7 @@ from lfrtorch.engine.linearised import linearise as linearise_of
 from lfrtorch.engine.newton import newton_states
 from lfrtorch.maps.activations import ACTIVATIONS
 
-pytestmark = pytest.mark.numeric
+pytestmark = [pytest.mark.numeric, pytest.mark.usefixtures("fast")]
 
 WAYS = [linear_recurrence, scan]  # of the CPU, and of any other device
 

@@ -12,6 +12,7 @@ from reference import SIZES, normal, polynomial_cell, random_cell
 from torch import Tensor, nn
 from torch.testing import assert_close
 
+from lfrtorch._support.threads import SLOW_PATHS
 from lfrtorch.engine import sensitivity
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
@@ -166,10 +167,6 @@ def rows_and_end(linearisation: Linearisation, kept: Tensor) -> list[Tensor]:
     return [whole, end]
 
 
-def generic(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(Linearisation, "_rows_compiled", Linearisation._rows_generic)
-
-
 @given(sizes=SIZES, R=st.integers(1, 3), T=st.integers(1, 30), block=st.integers(1, 40))
 @settings(max_examples=25)
 def test_compiled_is_generic_in_whatever_blocks_and_columns(
@@ -177,17 +174,18 @@ def test_compiled_is_generic_in_whatever_blocks_and_columns(
 ):
     cell = random_cell(**sizes)
     u = normal(R, T, cell.nu)
-    linearisation = Linearisation(cell, u, simulate(cell, u, normal(R, cell.nx, seed=1)))
-    P = linearisation.parameters
+    trajectory = simulate(cell, u, normal(R, cell.nx, seed=1))
+    P = Linearisation(cell, u, trajectory).parameters
     kept = torch.arange(P)[torch.rand(P, generator=torch.Generator().manual_seed(T)) < 0.7]
     with pytest.MonkeyPatch.context() as monkeypatch:
-        generic(monkeypatch)
-        expected = rows_and_end(linearisation, kept)
+        monkeypatch.setenv(SLOW_PATHS, "1")
+        expected = rows_and_end(Linearisation(cell, u, trajectory), kept)
     with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setenv(SLOW_PATHS, "")
         monkeypatch.setattr(sensitivity, "BLOCK", block)
         monkeypatch.setattr(sensitivity, "PASS", block)
         monkeypatch.setattr(sensitivity, "KEPT", block)
-        blocked = Linearisation(cell, u, linearisation.trajectory)
+        blocked = Linearisation(cell, u, trajectory)
         for mine, other in zip(rows_and_end(blocked, kept), expected, strict=True):
             assert_jacobian(mine, other)
 
@@ -241,12 +239,12 @@ def test_columns_are_shared_among_any_number_of_threads(threads: int, monkeypatc
         assert_jacobian(mine, other)
 
 
-@pytest.mark.parametrize("way", ["compiled", "generic"])
-def test_faded_sensitivities_are_zero_and_never_denormal(way: str, monkeypatch):
+@pytest.mark.usefixtures("fast")
+@pytest.mark.parametrize("own", [False, True])
+def test_faded_sensitivities_are_zero_and_never_denormal(own: bool):
     """dy(k)/dBu of a unit pulse is a^(k - 1): each power is exact. Driven again, it fades again."""
-    if way == "generic":
-        generic(monkeypatch)
-    cell = LFRCell(1, 1, 1, dtype=torch.float64, random=False)
+    static = Cubic(1, 1) if own else None  # which torch computes, and which has no effect
+    cell = LFRCell(1, 1, 1, int(own), int(own), static, dtype=torch.float64, random=False)
     with torch.no_grad():
         for p, value in ((cell.A, 0.5), (cell.Bu, 1.0), (cell.Cy, 1.0), (cell.Dyu, 0.0)):
             p.fill_(value)
@@ -256,7 +254,7 @@ def test_faded_sensitivities_are_zero_and_never_denormal(way: str, monkeypatch):
     since = torch.stack([k - 1, k - 1301])
     expected = torch.where(since >= 0, 0.5**since, 0.0).sum(0)
     J = output_jacobian(Linearisation(cell, u, simulate(cell, u, u.new_zeros(2, 1))))
-    by_Bu = J[:, :, 0, 1]  # of A, Bu, Cy, Dyu
+    by_Bu = J[:, :, 0, 1]  # of A, Bu, ...
     assert_close(by_Bu, expected.expand(2, -1), rtol=0, atol=1e-30)
     assert not ((by_Bu > 0) & (by_Bu < torch.finfo(u.dtype).tiny)).any()
     assert not by_Bu[:, -1].any()

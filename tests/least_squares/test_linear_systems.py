@@ -38,6 +38,7 @@ def test_blocks_are_one_piece(kind, threads: int, monkeypatch):
     assert_close(squares(factor), rows.mT @ rows, rtol=1e-12, atol=1e-11)
 
 
+@pytest.mark.usefixtures("fast")
 @pytest.mark.parametrize("threads", [1, 3])
 def test_blocks_of_many_columns(threads: int, monkeypatch):
     """In panels, and in pieces where a block is tall; more columns than a panel count divides."""

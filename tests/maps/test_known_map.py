@@ -75,6 +75,7 @@ def signals(cell: LFRCell):
     return u, torch.rand(2, cell.nx, dtype=torch.float64, generator=generator)
 
 
+@pytest.mark.usefixtures("fast")
 @pytest.mark.parametrize("method", METHODS)
 def test_machine_code_simulates_the_equations(method: str):
     for cell in cells(method):
@@ -87,6 +88,7 @@ def test_machine_code_simulates_the_equations(method: str):
                 assert_close(part[r], own, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.usefixtures("fast")
 @pytest.mark.parametrize("method", METHODS)
 def test_derivatives_are_those_of_torch_func(method: str):
     for cell in cells(method):
@@ -150,6 +152,7 @@ def test_a_centred_hold_is_that_of_the_middle_of_samples():
     assert errors[1] < 0.003
 
 
+@pytest.mark.usefixtures("fast")
 @pytest.mark.parametrize("method", METHODS)
 def test_float32_runs_in_the_same_machine_code(method: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(simulation, "newton_states", None)  # what torch would do

@@ -13,7 +13,7 @@ from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.maps.static_map import as_map
 
-pytestmark = pytest.mark.numeric
+pytestmark = [pytest.mark.numeric, pytest.mark.usefixtures("fast")]
 
 R, T, nz, nw = 2, 5, 2, 3
 
