@@ -228,6 +228,7 @@ def test_integrators_are_held_in_their_columns():
     columns = [F, H, F]
     assert cell.held["A"].tolist() == [columns] * 3
     assert cell.held["Cz"].tolist() == [columns]
+    assert cell.Cz[0, 1].item() == 0.0
     assert torch.equal(cell.A.detach(), A)
 
 

@@ -237,6 +237,15 @@ def test_fixed_entries_beside_a_frozen_parameter_and_start_states():
     assert_close(J[..., kept] @ expand, J, rtol=0, atol=1e-9 * float(J.abs().max()))
 
 
+def test_fixed_entries_of_a_model_without_gauge_directions():
+    """Its start states are given, and no static map absorbs coordinates."""
+    cell = random_cell(1, 1, 2, 0, 0, radius=0.5)
+    fixed = entries(cell, "Bu")
+    kept, expand = reduction(cell, none(cell), coordinates=False, fixed=fixed)
+    assert kept.tolist() == torch.nonzero(~fixed).flatten().tolist()
+    assert torch.equal(expand, torch.eye(len(fixed)).double()[~fixed])
+
+
 def test_reduction_of_before_does_not_bring_fixed_entries_back():
     cell = random_cell(1, 1, 2, 1, 1, 3, radius=0.5)
     before = reduction(cell, none(cell))
