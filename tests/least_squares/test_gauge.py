@@ -294,3 +294,10 @@ def test_free_directions_move_nothing_that_is_held(kind: str, nx: int, branches:
     assert free_directions(cell) == N.shape[1]
     assert not cell.Bw.any()
     assert not cell.static.Ww.any()
+
+
+def test_directions_that_move_the_same_entry_count_once():
+    """T Bu of the four T with one entry 1: two pairs that are parallel."""
+    cell = random_cell(1, 1, 2, 1, 1, 3)
+    cell.hold({"Bu": (torch.tensor(True), cell.Bu.detach())})
+    assert free_directions(cell) == 2**2 + 1 + 1 - 2

@@ -141,6 +141,18 @@ def test_a_bound_that_others_make_needless_holds_no_step_back():
     assert float(step[5]) == pytest.approx(-0.01)
 
 
+def test_room_shrinks_by_what_a_step_takes_each_pole_beyond():
+    """One pole goes in and the other out, so that they change their order."""
+    A = torch.diag(torch.tensor([0.999, 0.95, 0.3], dtype=torch.float64))
+    bounds, step = PoleBounds(A, NONE[:3], LIMIT), torch.zeros(12, dtype=torch.float64)
+    assert bounds.room.tolist() == pytest.approx([LIMIT - 0.999, LIMIT - 0.95])
+    assert bounds.tightened(step, bounds.room) is None
+    step[0], step[4] = -0.2, 0.08
+    found = bounds.tightened(step, bounds.room)
+    assert found is not None
+    assert found.tolist() == pytest.approx([LIMIT - 0.999, LIMIT - 0.95 - (1.03 - LIMIT)])
+
+
 def test_poles_of_delays_bound_no_step():
     """Three samples of delay: an eigenvalue 0 of one eigenvector, which has no derivative."""
     A = torch.diag(torch.ones(3, dtype=torch.float64), 1)
