@@ -32,7 +32,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.analysis.gradients import Gradients, root
 from lfrtorch.analysis.linearisation import linear_part, linearise
 from lfrtorch.analysis.noise_model import LEAST, NoiseModel, Spectra, colours, innovations
-from lfrtorch.analysis.output_residuals import LEVEL, ROUNDING, SLIGHT, OutputResiduals
+from lfrtorch.analysis.output_residuals import FINDINGS, LEVEL, ROUNDING, SLIGHT, OutputResiduals
 from lfrtorch.analysis.residual_analysis import SHORTEST, of_simulation
 from lfrtorch.analysis.static_slopes import infinite_slope
 from lfrtorch.analysis.training_reach import TrainingReach
@@ -486,14 +486,10 @@ def _doubts(
         wrong = _dependent(every, model, _weighted_step(every, sizes))
     if wrong:
         part, name = min(wrong, key=lambda pair: pair[0].p[pair[1]])
-        what = {
-            "inputs": "the inputs",
-            "even": "the squares of the inputs",
-            "odd": "the inputs by an odd nonlinearity",
-        }[name]
         found.append(
-            f"the residuals of {part.output.name} in record '{part.record}' depend on {what} "
-            "still: the model is too small, and the bands are too narrow, as they know noise only."
+            f"the residuals of {part.output.name} in record '{part.record}' depend on "
+            f"{FINDINGS[name][1]} still: the model is too small, and the bands are too narrow, as "
+            "they know noise only."
         )
     if left[0] > 1.0:  # standard errors, rms over the directions
         found.append(

@@ -24,11 +24,12 @@ SLIGHT = 0.1
 """Correlations below this are 1 % of the power at most; only long records show them."""
 
 
-_LEFT = {
-    "inputs": "depends on {} still", "even": "an even nonlinearity of {} is left",
-    "odd": "an odd nonlinearity or a gain of {} is left",
-}  # fmt: skip
-"""What a test finds of an input."""
+FINDINGS = {
+    "inputs": ("depends on {} still", "the inputs"),
+    "even": ("an even nonlinearity of {} is left", "the squares of the inputs"),
+    "odd": ("an odd nonlinearity or a gain of {} is left", "the inputs by an odd nonlinearity"),
+}
+"""By test: the verdict on an input, and the quantity that the residuals depend on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,7 @@ class OutputResiduals:
         if not white:
             found.append(f"not white: {_where(self.whiteness)}")
         found += [
-            f"{_LEFT[name].format(channel.name)}: {_where(c)}"
+            f"{FINDINGS[name][0].format(channel.name)}: {_where(c)}"
             for name, each in self.tests.items()
             for channel, c in zip(self.inputs, each, strict=True)
             if len(each) * c.p <= LEVEL
