@@ -51,7 +51,7 @@ _UNREADABLE = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What a damaged file of numpy raises; its headers may declare more than there is memory for."""
+"""Errors of a damaged file of numpy; its header may declare more than there is memory for."""
 
 Stored = Callable[[Path], AbstractContextManager[Any]]
 """Opens a file: its arrays by name."""
@@ -89,7 +89,7 @@ class Signal:
 
     @property
     def vector(self) -> bool:
-        """Whether it is the samples of one channel."""
+        """Tell if an array has the samples of one channel."""
         return max(self.shape, default=1) == np.prod(self.shape) > 1
 
     def refusal(self) -> str:
@@ -398,7 +398,7 @@ def _refusal(item: Any, above: frozenset[int], matlab: bool) -> str:
 
 
 def _packing(item: Any) -> _Packing | None:
-    """What the attributes of a dataset say of how its numbers are stored."""
+    """Storage of a dataset's numbers, as its attributes describe it."""
     given = [
         np.asarray(item.attrs.get(key)) for key in ("scale_factor", "add_offset", "_FillValue")
     ]
@@ -413,7 +413,7 @@ def _packing(item: Any) -> _Packing | None:
 
 
 def _linked(group: Any, key: str) -> Any:
-    """What a group lists, or why it is not in its file: no file opens another one, or a device."""
+    """Members of a group, or the reason why a link is refused: no file opens another file."""
     h5py = optional("h5py")
     link = group.get(key, getlink=True)
     if isinstance(link, h5py.ExternalLink):

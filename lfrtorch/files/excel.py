@@ -27,7 +27,7 @@ _MOST_ROWS = 2**20
 """Rows that a sheet of Excel may have."""
 
 _PACKED = 100
-"""How many times longer a part of 1e8 bytes may be than it is packed: see Apache POI,
+"""Largest ratio of unpacked to packed size for parts of 1e8 bytes and more: see Apache POI,
 ZipSecureFile, whose limits are 100 times and 1e5 bytes. Sheets of numbers are packed 5 to 20 times.
 """
 

@@ -27,7 +27,7 @@ FORMATS: dict[str, Callable[[Path], Table]] = {
     **dict.fromkeys(EXTENSIONS, ExcelTable),
     **READERS,
 }
-"""How a file is read, by its extension; a text file may be compressed (.csv.gz)."""
+"""Readers by extension; a text file may be compressed (.csv.gz)."""
 
 _SHOWN = 8
 _INSTEAD = {
@@ -76,7 +76,7 @@ def extension(path: Path) -> str:
 
 
 def similar(path: Path) -> str:
-    """What there is in place of a file that is not there, as the end of a message."""
+    """Files in place of a missing one, as the end of a message."""
     folder = path.parent
     while not folder.is_dir() and folder != folder.parent:
         folder = folder.parent

@@ -94,7 +94,7 @@ def load_records(
     A file is one record. It is one for each of its runs if a column that is named as their number
     is, as ``run`` or ``trial``, has each of its values in one stretch, or if the time begins again.
 
-    What is cut off by a fraction begins where its record begins and is simulated from there: only
+    A part cut off by a fraction is simulated from the beginning of its record: only
     its own part is scored, so that the transient of the start reaches neither validation nor test.
 
     Args:
@@ -109,7 +109,7 @@ def load_records(
         time: the column of time stamps, in seconds or as ISO date-times. Default: one that is named
             as time is; or a lone number like ``Fs`` in a file of arrays; or another column that
             rises evenly. Signals at uneven times are interpolated to even ones.
-        units: of the channels by name or column number. Default: those in the file's header.
+        units: units of the channels by name or column number. Default: those in the file's header.
         validation: records that choose among iterates and are not fitted: a fraction below 1 of
             every record, the part after that for training; a number of records, the last ones;
             names of records of ``path``, which are those of the files without extension; or other
@@ -125,8 +125,8 @@ def load_records(
             ``test="all"`` all are from rest.
         period: samples of one period of the inputs; ``"auto"`` finds it, ``None`` is none.
         skip: samples at the beginning of every record that are left out of cost and score.
-            Default: of records from rest the periods that the output takes to settle, or 5 % if
-            the input does not repeat. Of an estimated start nothing, and scores leave out the first
+            Default: a record from rest skips the periods in which the output settles, or 5 % if
+            the input does not repeat. An estimated start skips none, and scores leave out the first
             50 samples, or a fifth of a shorter record.
         gaps: ``"error"`` refuses missing inputs and missing time stamps, and leaves outputs without
             a value out of fits and scores (``Record.valid``); up to four samples in a row that the
@@ -134,7 +134,7 @@ def load_records(
             stretch between missing values of any kind.
         limits: least and greatest output that the sensors show, see :class:`lfrtorch.Record`; for
             example ``(None, 10)``.
-        reference: what is set if a controller makes the inputs, or what a generator plays if the
+        reference: setpoint if a controller makes the inputs, or the generator's signal if the
             inputs are measured with noise: one or several columns, as for ``inputs``, one for each
             of these; see :class:`lfrtorch.Record`.
 
@@ -288,7 +288,7 @@ class _Reader:
         return found
 
     def _measured(self, source: Path | Table) -> Measurement:
-        """What a file measured, checked to be of a kind with the first."""
+        """Measurement of a file; refuse one that differs in kind from the first."""
         path = place_of(source)
         try:
             measured = read_measurement(source, self.wanted)
@@ -401,7 +401,7 @@ class _Reader:
         return T - round(T * self.unseen)
 
     def _whole_periods(self, T: int, N: int) -> bool:
-        """Whether a record is made of periods, of which each of its parts has one at least."""
+        """Tell if a record consists of periods, at least one in each of its parts."""
         parts = [max(1, round(T // N * part)) for part in (self.validation, self.unseen) if part]
         return T % N == 0 and max(1, sum(parts)) < T // N
 

@@ -27,7 +27,7 @@ Read = Callable[[Path], Mapping[str, Series | str]]
 
 
 def _reader(read: Read, kind: str) -> Callable[[Path], Table]:
-    """What opens a file, with one message for all ways in which it may be damaged."""
+    """Make a function that opens a file, with one message for all kinds of damage."""
 
     def opened(path: Path) -> Table:
         file = Path(str(path).rpartition("#")[0]) if not path.is_file() else path
@@ -161,7 +161,7 @@ def _mcap(path: Path) -> dict[str, Series]:
 
 
 def _decoder(schema: Any, encoding: str) -> Callable[[bytes], Any]:
-    """What turns the bytes of a message into fields."""
+    """Make a decoder of the bytes of a message."""
     if encoding == "json":
         return json.loads
     if encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
@@ -232,4 +232,4 @@ READERS: dict[str, Callable[[Path], Table]] = {
     ".db3": _reader(_bag, "ROS 2 bag"),
     **dict.fromkeys((".uff", ".unv"), _reader(_uff, "UFF")),
 }
-"""How a file is read, by its extension; ``#50Hz`` behind it puts all channels on one clock."""
+"""Readers by extension; ``#50Hz`` behind the path puts all channels on one clock."""

@@ -42,7 +42,7 @@ def variables_in(path: Path) -> list[Variable]:
 
 
 class _Unpacked(io.RawIOBase):
-    """What was packed in the next bytes of a stream."""
+    """Unpack the next bytes of a stream."""
 
     def __init__(self, stream: IO[bytes], size: int) -> None:
         self._stream, self._left, self._zlib = stream, size, zlib.decompressobj()

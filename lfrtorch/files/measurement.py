@@ -34,7 +34,7 @@ LARGEST = 2**22
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is read of every file; see :func:`lfrtorch.load_records`."""
+    """Selection of signals to read from every file; see :func:`lfrtorch.load_records`."""
 
     inputs: Columns | None
     outputs: Columns | None
@@ -371,7 +371,7 @@ def _gap(
     grid: OnGrid,
     beside: Sequence[int],
 ) -> ValueError:
-    """What is missing, and what to do."""
+    """Message on missing values, with a remedy."""
     empty = np.isnan(values)
     rows = np.asarray(empty.any(axis=1))
     said = []

@@ -21,22 +21,31 @@ from lfrtorch._support.types import Array
 from lfrtorch.files.table import BLOCK, Table, rate_behind
 
 _UNEVEN = 0.01
-"""Of a step, that a time may be off an even clock."""
+"""Largest deviation of a time from an even clock, relative to a step."""
 
 _SAME = 0.01
 """Relative difference of rates that are one."""
 
-_HOLE, _RARE = 5, 0.05
-"""Steps without a sample that are a hole, and not what messages do; at most so many of all are."""
+_HOLE = 5
+"""Steps without a sample that are a hole, and no jitter of messages."""
 
-_LIKE, _MOST = 0.2, 0.75
-"""A clock has a rate if so many of its steps are off their median by so much of it at most."""
+_RARE = 0.05
+"""Largest part of all steps that are holes."""
+
+_LIKE = 0.2
+"""Largest deviation of a usual step from the median step of a clock, relative to it."""
+
+_MOST = 0.75
+"""Least part of usual steps of a clock that has a rate."""
 
 _FEW = 10
 """Samples that are too few to show a rate."""
 
-_SLOWER, _FAR = 2, 20
-"""Times that a channel on change is slower than another one: at least, and without other signs."""
+_SLOWER = 2
+"""Least ratio by which a channel on change is slower than another one."""
+
+_FAR = 20
+"""The same ratio for a channel without other signs of that."""
 
 
 class Series(NamedTuple):

@@ -51,7 +51,7 @@ class Table(ABC):
     Args:
         path: the file.
         headers: the columns as the file names them; units stand in them in brackets or behind "/".
-        units: of columns by header, if the file has them apart.
+        units: units of columns by header, if the file has them apart.
         arrays: column numbers by the name of an array of several channels.
         refused: why something in the file is not a channel, by its name.
         rates: sampling frequencies in Hz that stand in the file, by their names.
@@ -62,9 +62,9 @@ class Table(ABC):
     path: Path
     columns: tuple[Channel, ...]
     notes: tuple[str, ...] = ()
-    """What a user should know of how the file is read."""
+    """Remarks on the reading of the file, for the user."""
     contents: Sequence[tuple[str, str, str]] = ()
-    """What is in a file of arrays: name and shape of each, and what it is taken for."""
+    """Contents of a file of arrays: name, shape and role of each."""
     asked: float | None = None
     """The rate in Hz that the signals are to be interpolated to, as in ``x.csv#50Hz``."""
 
@@ -134,7 +134,7 @@ class Table(ABC):
         return not self.lengths or self.lengths[column] == self.lengths[columns[0]]
 
     def where(self, sample: int) -> str:
-        """What a user finds the sample by."""
+        """Place of a sample, as a user finds it."""
         return f"sample {sample} (from 0)"
 
     def read(self, columns: Sequence[int]) -> Array:

@@ -59,7 +59,7 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """How a file or a sheet is written."""
+    """Layout of a file or a sheet."""
 
     encoding: str
     delimiter: str
@@ -152,7 +152,7 @@ class TextTable(FrameTable):
         return super().where(sample)
 
     def _place(self, number: int) -> str:
-        """What a user finds a line by."""
+        """Place of a line, as a user finds it."""
         return f"line {number}"
 
     @contextmanager
@@ -174,7 +174,7 @@ class TextTable(FrameTable):
                     yield text
 
     def _is_text(self, line: str) -> str:
-        """What a line says that begins with words where numbers are; empty if it is a sample."""
+        """Text of a line that begins with words in columns of numbers; empty if it is a sample."""
         start = line.lstrip(' "\t')[:1]
         if not (self.layout.leads and (start.isalpha() or start == "*")):
             return ""
@@ -327,7 +327,7 @@ def _bulk(lines: Sequence[Line]) -> list[list[str]]:
 
 
 def _order(delimiter: str, lines: Sequence[Line]) -> tuple[float, float]:
-    """How well a delimiter does: the share of cells that are numbers, then their count."""
+    """Quality of a delimiter: the share of cells that are numbers, then their count."""
     bulk = _bulk(lines)
     commas = (False,) if delimiter == "," else (False, True)
     known = [
@@ -423,7 +423,7 @@ def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> L
 
 
 def _decimal_comma(whole: list[list[str]]) -> bool:
-    """Whether numbers have a decimal comma: no column has a point, or fewer than have a comma."""
+    """Tell if numbers have a decimal comma: no column has a point, or fewer than have a comma."""
     commas, points, thousands = set(), set(), set()
     for cells in whole:
         for i, cell in enumerate(cells):
@@ -437,7 +437,7 @@ def _decimal_comma(whole: list[list[str]]) -> bool:
 def named_by_numbers(
     cells: Sequence[str], below: Sequence[Sequence[str]], *, comma: bool = False
 ) -> bool | None:
-    """Whether a line is a header in which numbers are names; None if it may be a sample."""
+    """Tell if a line is a header with numbers as names; None if it may be a sample."""
     # It is if these are unlike all samples below, or 0, 1, 2 ... as pandas writes them. It is none
     # if a column runs on from it, as a time does.
     numbers = {i: int(cell) for i, cell in enumerate(cells) if _WHOLE.fullmatch(cell)}
@@ -467,7 +467,7 @@ def named_by_numbers(
 
 
 def _runs_on(number: float, column: Sequence[float]) -> bool:
-    """Whether a column rises evenly, or stands still, from a number on."""
+    """Tell if a column rises evenly, or is constant, from a number on."""
     steps = np.diff([number, *column[:LEAST]])
     usual = float(np.median(steps))
     return bool(not steps.any() or (steps.min() > 0 and 0.5 <= steps[0] / usual <= 2))
@@ -520,7 +520,7 @@ def _is_date(cell: str) -> bool:
 
 
 def _is_time(cell: str) -> bool:
-    """Whether there is such a day, too: 2020-02-30 is written as a date."""
+    """Tell if the day exists, too: 2020-02-30 has the form of a date."""
     import pandas as pd
 
     try:
@@ -530,7 +530,7 @@ def _is_time(cell: str) -> bool:
 
 
 def _is_missing(cell: str) -> bool:
-    """Whether a cell says that there is no value."""
+    """Tell if a cell stands for a missing value."""
     return cell.lower() in _MISSING
 
 
@@ -541,7 +541,7 @@ def with_point(cell: str, *, comma: bool) -> str:
 
 
 def _with_thousands(cell: str) -> bool:
-    """Whether a comma may be one between thousands, as in 5,189."""
+    """Tell if a comma may separate thousands, as in 5,189."""
     return _THOUSANDS.fullmatch(cell) is not None
 
 

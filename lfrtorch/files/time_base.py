@@ -1,4 +1,4 @@
-"""What tells the times of a file's samples: a column, or a number; and the runs in it."""
+"""Time base of a file's samples: a column, or a number; and the runs in the file."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class OnGrid(NamedTuple):
 
     @property
     def holes(self) -> tuple[int, int, int]:
-        """How many there are, how many samples are missing in them, and the first row behind."""
+        """Number of gaps, number of missing samples in them, and the first row behind one."""
         found = [
             (int(b.rows[0]), round(b.start - a.start - a.places[-1]) - 1)
             for run in self.pieces
@@ -77,7 +77,7 @@ def find_base(
     """Return what tells the times of a file of which columns ``used`` are something else.
 
     It is the column that the user names, else one that is named as time is; a lone number like
-    ``Fs``; the first other column that rises evenly. With ``fs`` it is a column named as time is
+    ``Fs``; the first other column that rises evenly. Given ``fs`` it is a column named as time is
     that runs at that rate, in some unit. Two that contradict one another are refused.
     """
     if stamps:
@@ -209,12 +209,12 @@ def on_grid(
     """Put the samples of a file on an even grid, run by run.
 
     Args:
-        base: what tells their times.
+        base: source of their times.
         T: samples.
         t: (T,), as they stand in the column of times.
         fs: sampling frequency in Hz that the user gave.
         used: columns that number no run.
-        whole: whether every missing sample is a hole, see :func:`even_times`.
+        whole: every missing sample is a hole, see :func:`even_times`.
     """
     times, unit = np.arange(T) / base.fs if table.asked and base.fs else None, ""
     try:
@@ -315,7 +315,7 @@ def _header(table: Table, base: TimeBase) -> str:
 
 
 def _labels(table: Table, used: Sequence[int], T: int) -> dict[str, NDArray[Any]]:
-    """What columns hold that are named as numbers of runs are."""
+    """Values of columns with names for run numbers."""
     found, measured = {}, set(used)
     for i, channel in enumerate(table.columns):
         if i not in measured and is_run(channel.name):

@@ -45,7 +45,7 @@ class TimeUnit(NamedTuple):
 
 
 def is_time(channel: Channel) -> bool:
-    """Whether a column is named as time is, as ``Time`` or ``time_ms``."""
+    """Tell if a column has a name for time, as ``Time`` or ``time_ms``."""
     return _NAMES.fullmatch(_named(channel)[0]) is not None
 
 

@@ -65,4 +65,4 @@ FORMATS: dict[str, Callable[[Path], AbstractContextManager[Write]]] = {
     ".npz": _npz,
     ".parquet": _parquet,
 }
-"""How a file is written, by its extension."""
+"""Writers by extension."""
