@@ -1,1 +1,1 @@
-"""What data look like before a fit."""
+"""Survey of data before a fit."""

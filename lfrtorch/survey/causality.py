@@ -34,7 +34,7 @@ _CHANCE, _CLEAR, _NEW = 1e-3, 4.0, 1e-3
 
 
 class TwoSidedResponse(NamedTuple):
-    """What the two-sided impulse response says of an input and an output."""
+    """Relation of an input and an output by their two-sided impulse response."""
 
     coherence: float  # share of the output's power that follows from the input, linearly
     chance: float  # coherence that unrelated signals would show

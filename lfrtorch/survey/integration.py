@@ -1,7 +1,7 @@
-"""Whether an output integrates the inputs, by the spectra at the lowest frequencies excited.
+"""Test for an output that integrates the inputs, by spectra at the lowest frequencies excited.
 
 If it integrates n times, its n-th difference V follows the inputs U there with a real gain that
-does not change with frequency. Of any other stable system that gain is imaginary and rises, or
+does not change with frequency. In any other stable system that gain is imaginary and rises, or
 belongs to a resonance and changes quickly. A fit of first order tells how soon the system forgets,
 
     V + a V / jω = (b + jω c) U,
@@ -124,7 +124,7 @@ def _differenced(y: Array, times: int) -> Complex:
 def _first_order(
     U: Complex, V: Complex, before: Complex, power: Array, first: int
 ) -> tuple[bool, bool]:
-    """Whether the fit of first order tells, and whether it says integrator."""
+    """Tell if the fit of first order is conclusive, and if it finds an integrator."""
     nu = U.shape[1]
     k = np.arange(first, min(3 * first + _LINES * nu, len(V)))
     k = k[power[k] > _STRONG * power[k].max()]
@@ -150,7 +150,7 @@ def _first_order(
 
 
 def _even(U: Complex, V: Complex, first: int) -> bool:
-    """Whether V follows U with a real gain that is the same in two bands."""
+    """Tell if V follows U with a real gain that is the same in two bands."""
     middle = 2 * first + 2 * U.shape[1]
     if 3 * middle > len(V):
         return False

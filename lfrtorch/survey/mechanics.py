@@ -1,4 +1,4 @@
-"""What closes a loop, and what rubs: feedback around a system, and dry friction in it."""
+"""Detection of feedback around a system, and of dry friction in it."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def _past(signals: Array, n: int) -> Array:
 
 
 def _left(target: Array, *columns: Array) -> Array:
-    """What columns and a constant leave of a target (T, m)."""
+    """Residuals of the regression of a target (T, m) on columns and a constant."""
     rows = np.hstack([np.ones((len(target), 1)), *columns])
     rows = rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
     return target - rows @ np.linalg.lstsq(rows, target, rcond=1e-12)[0]

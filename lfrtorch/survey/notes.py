@@ -1,4 +1,4 @@
-"""What in a measurement will hurt a model, and what to do about it, in sentences."""
+"""Notes on a measurement: faults that will hurt a model, each with a remedy."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def notes_on(
 ) -> list[str]:
     """Say what will hurt a model of the records, and what to do about it, a sentence each.
 
-    If there are several records, a sentence names the one it is about. What they skip is not looked
+    If there are several records, a sentence names the record. Skipped samples are not looked
     at; ``given`` is that of :func:`examine`.
     """
     data = as_records(records)
@@ -303,7 +303,7 @@ def _outliers(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]
 
 
 def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
-    """What inputs in a stretch (T, nu) without gaps excite, and how fast it was sampled."""
+    """Notes on the excitation by inputs (T, nu) without gaps, and on the sampling frequency."""
     T, fs, unit = len(u), found.fs or 1.0, _unit(found)
     for one, signal in zip(found.inputs, u.T, strict=True):
         if one.band is None:
@@ -419,7 +419,7 @@ def _repeats(one: SignalSurvey) -> bool:
 
 
 def _first(pair: TwoSidedResponse) -> bool:
-    """Whether the output comes before the input."""
+    """Tell if the output precedes the input."""
     return (
         pair.coherence - pair.chance > _COHERENT
         and pair.causality < _BEFORE
@@ -429,7 +429,7 @@ def _first(pair: TwoSidedResponse) -> bool:
 
 
 def _drift(output: SignalSurvey, y: Array, u: Array) -> Iterator[Note]:
-    """Whether an output (T,) drifts, and the inputs (T, nu) and their magnitudes do not."""
+    """Tell if an output (T,) drifts, and the inputs (T, nu) and their magnitudes do not."""
     share, slope = _trend(y)
     thirds = [_trend(part)[1] for part in np.array_split(y, 3)] if len(y) >= _SHORT else [0.0]
     steady = all(slope * third > 0 and 1 / _ALIKE < third / slope < _ALIKE for third in thirds)
@@ -489,7 +489,7 @@ def _still(found: Survey, u: Array, y: Array) -> tuple[int, int]:
 
 
 def _frequencies(signal: Array) -> int:
-    """How many frequencies a signal (T,) excites, about."""
+    """Approximate number of frequencies that a signal (T,) excites."""
     _, power = scipy.signal.periodogram(signal, window="hann")
     excited = power > _LINE * power.max()
     groups = np.sum(np.diff(excited.astype(np.int8), prepend=0) == 1)

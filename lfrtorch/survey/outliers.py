@@ -1,6 +1,6 @@
 """Outliers: one or two samples that stick out of a signal as nothing else in it does.
 
-How far a sample sticks out is what opening and closing by three samples take off (the white and the
+The height of a sample is the part removed by opening and closing by three samples (white and
 black top-hat): nothing at a step, at a drift or in a smooth signal, the whole height of a lone
 sample. Outliers stick out farther than the tail of these heights promises, a Weibull tail
 

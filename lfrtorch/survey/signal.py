@@ -44,23 +44,23 @@ class Extreme(NamedTuple):
 
 
 class SignalSurvey(NamedTuple):
-    """What a signal of T samples is like; numbers are NaN if it has no values.
+    """Statistics of a signal of T samples; numbers are NaN if it has no values.
 
     Args:
         channel: its name and unit.
         samples: T.
-        missing: how many of them are NaN.
-        gap: how many of them in a row.
-        mean, rms: of the signal, and about its mean.
+        missing: number of samples that are NaN.
+        gap: largest number of NaN in a row.
+        mean, rms: mean of the signal, and rms about it.
         minimum, maximum: its extremes.
-        values: how many different ones there are.
+        values: number of different values.
         step: smallest difference of two of them.
         band: frequencies in Hz between which 99 % of the power about the mean lies.
         period: samples of a period, ``None`` if it does not repeat.
         noise: its estimated rms, ``None`` if it cannot be told from the signal.
-        method: of the noise. ``"periods"``: the scatter of whole periods in steady state;
+        method: estimate of the noise. ``"periods"``: the scatter of whole periods in steady state;
             ``"spectrum"``: a guess, the level of the quietest part of the spectrum as if of white
-            noise. Of an output it is what does not follow the inputs; of another signal too much
+            noise. An output has the part that does not follow the inputs; other signals too much
             if signal is everywhere. Too little if a filter took noise away.
     """
 
