@@ -13,7 +13,7 @@ _MODULES = {"Console": "console", "write": "run_files"}
 
 
 def __getattr__(name: str) -> Any:
-    """What draws or prints is imported on first use: matplotlib and TensorBoard take their time."""
+    """Import functions that draw or print on first use: matplotlib and TensorBoard are slow."""
     if name in _MODULES:
         return getattr(import_module(f"lfrtorch.reporting.{_MODULES[name]}"), name)
     raise AttributeError(f"module 'lfrtorch.reporting' has no attribute '{name}'")

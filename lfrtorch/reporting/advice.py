@@ -187,7 +187,7 @@ def _larger(e: Evidence, states: Mapping[str, int] | None = None) -> dict[str, i
 
 
 def _borne(e: Evidence, change: Mapping[str, int]) -> bool:
-    """Whether larger sizes are advised: validation has not grown, and the samples bear them."""
+    """Tell if larger sizes are advised: validation has not grown, and the samples suffice."""
     growth = _weights({**e.sizes, **change}) / _weights(e.sizes)
     return (e.overfit or 0.0) <= _CLOSE and e.bears(growth)
 

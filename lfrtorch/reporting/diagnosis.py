@@ -1,4 +1,4 @@
-"""What the records, their simulations and the history of a fit say about its errors, in numbers.
+"""Evidence on the errors of a fit, in numbers: from records, simulations and history.
 
 Errors are root mean squares relative to the standard deviation of the training outputs, so that
 outputs of any unit count alike.
@@ -117,12 +117,12 @@ class Evidence:
 
     @property
     def better(self) -> bool:
-        """Whether the verdict says that the NL-LFR is the better model."""
+        """True if the verdict is that the NL-LFR is the better model."""
         return self.verdict is not None and self.verdict.kind == Kind.BETTER
 
     @property
     def neither(self) -> bool:
-        """Whether the verdict says that neither model is usable."""
+        """True if the verdict is that neither model is usable."""
         return self.verdict is not None and self.verdict.use == NEITHER
 
     @property
@@ -163,19 +163,19 @@ class Evidence:
 
     @property
     def useless(self) -> bool:
-        """Whether the NL-LFR is hardly better than the linear model."""
+        """True if the NL-LFR is hardly better than the linear model."""
         return self.gain is not None and self.gain > USELESS
 
     @property
     def unexplained(self) -> bool:
-        """Whether neither model explains the training outputs, nor would one of more states."""
+        """True if neither model explains the training outputs, nor would one with more states."""
         if not self.neither or self.train is None or not self.linear_train:
             return False
         return min(self.train, self.linear_train) > UNEXPLAINED and not self.states_missing
 
     @property
     def lost_on_tests(self) -> bool:
-        """Whether the tests have nothing of the gain over the linear model."""
+        """True if the gain over the linear model is absent in the tests."""
         if self.tests is None or self.gain is None or self.useless or self.better:
             return False
         return self.tests > USELESS
@@ -205,13 +205,13 @@ class Evidence:
 
     @property
     def overtrained(self) -> bool:
-        """Whether validation rose after the kept iterate, as training went on with noise."""
+        """True if validation rose after the kept iterate, while training fitted noise."""
         # Training error falls while validation rises.
         crowded = not (self.bears(1.0) or self.states_missing)
         return crowded and self.risen >= 1.05 and self.fell <= 0.99
 
     def bears(self, growth: float) -> bool:
-        """Whether the samples bear ``growth`` times the parameters."""
+        """Tell if the samples suffice for ``growth`` times the parameters."""
         # With ten samples a parameter, p/M = 0.1, fitted white noise is √((1 + p/M) / (1 - p/M)) =
         # 1.1 times as large on other samples. If there are more, the map is too small instead: with
         # 11 and 21 a larger one was the better on the coupled drives and the tanks. A larger map
@@ -220,7 +220,7 @@ class Evidence:
 
     @property
     def noise_limited(self) -> bool:
-        """Whether the training error is noise, the search at its end, and validation agrees."""
+        """True if the training error is noise, the search at its end, and validation agrees."""
         if not self.noise or self.train is None or self.falling > FALLING:
             return False
         if not SOUND * self.noise <= self.train <= NOISE_LIMITED * self.noise:
@@ -238,17 +238,17 @@ class Evidence:
 
     @property
     def states_missing(self) -> bool:
-        """Whether the error has a part that is linear in the inputs."""
+        """True if the error has a part that is linear in the inputs."""
         return (self.linear or 0.0) > LINEAR
 
     @property
     def structured(self) -> bool:
-        """Whether the training error has a part that noise has not."""
+        """True if the training error has a part that noise does not have."""
         return self.states_missing or (self.nonlinear or 0.0) > NONLINEAR
 
     @property
     def parts_differ(self) -> bool:
-        """Whether validation and training records are unlike, and not by chance."""
+        """True if validation and training records differ, and not by chance."""
         if not self.linear_train or self.linear_validation is None:
             return False
         ratio = self.linear_validation / self.linear_train
@@ -256,12 +256,12 @@ class Evidence:
 
     @property
     def proven(self) -> bool:
-        """Whether every step kept a proof, so that no sizes or ridge can be chosen."""
+        """True if every step kept a proof, so that no sizes or ridge can be chosen."""
         return getattr(self.trainer, "guarantee", None) not in (None, "stable")
 
     @property
     def given(self) -> bool:
-        """Whether sizes and ridge cannot be left to the data."""
+        """True if sizes and ridge cannot be chosen from the data."""
         return self.continued or self.proven or self.known
 
 

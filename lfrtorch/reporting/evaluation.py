@@ -106,7 +106,7 @@ def of_samples(scored: int, samples: int, skip: int, records: int = 1) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What models make of a record, in physical units."""
+    """Simulations of a record by the models, in physical units."""
 
     record: Record
     use: str
@@ -142,7 +142,7 @@ class Response:
 
     @property
     def diverged(self) -> bool:
-        """Whether the NL-LFR's output has samples that are not finite."""
+        """True if the NL-LFR's output has samples that are not finite."""
         return not bool(np.isfinite(self.y_hat).all())
 
     @cached_property

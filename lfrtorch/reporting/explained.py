@@ -1,4 +1,4 @@
-"""Which part of the errors of a simulation a filter would explain: what a model has left out."""
+"""Part of the errors of a simulation that a filter would explain: dynamics that a model lacks."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ import scipy
 from lfrtorch._support.types import Array
 from lfrtorch.reporting.evaluation import Response
 
-LONGEST, SHORTEST = 1024, 64
-"""Samples of a segment: as long as the memory of an error filter may be, and too few to tell."""
+LONGEST = 1024
+"""Most samples of a segment, which limit the memory of an error filter."""
+
+SHORTEST = 64
+"""Samples below which a segment tells nothing."""
 
 
 SHIFTS = 0.276, 0.382, 0.618, 0.724

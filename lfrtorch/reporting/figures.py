@@ -21,8 +21,11 @@ from lfrtorch.reporting.evaluation import Response, ranked
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.step_plots import steps
 
-MOST_OUTPUTS, MOST_RECORDS = 4, 4
-"""Outputs in one figure, and records of which the report has all views."""
+MOST_OUTPUTS = 4
+"""Most outputs in one figure."""
+
+MOST_RECORDS = 4
+"""Most records of which the report has all views."""
 
 _MOST_WORK = 1e9
 """Samples times squared parameters up to which the bands are drawn: a second or two."""
@@ -107,7 +110,7 @@ def of_record(
 
 
 def _uncertainty(run: Run) -> Uncertainty | None:
-    """How far the parameters are known, if the model is one of simulations and not too large."""
+    """Uncertainty of the parameters, if the model is one of simulations and not too large."""
     records = run.dataset.train if run.refit is None else estimation_records(run.dataset)
     samples = sum(record.y.size for record in records)
     large = samples * run.model.parameter_count**2 > _MOST_WORK

@@ -105,7 +105,7 @@ def _address(png: bytes) -> str:
 
 
 def comparisons(evaluation: Evaluation) -> list[str]:
-    """How far the NL-LFR came, beside the linear model: a line for each output of a few tests."""
+    """Errors of the NL-LFR and of the linear model: a line for each output of a few tests."""
     # Without tests the lines are on the validation records, or else on the training records.
     responses = evaluation.simulations
     _, usual = training_deviations(responses)

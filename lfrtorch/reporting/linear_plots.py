@@ -30,9 +30,11 @@ MODEL, NOISE, ODD = "black", "0.5", TOTAL
 _GRID = 500  # frequencies at which a model is drawn, beside those of its poles
 _LOWEST = 1e-3  # first frequency of a model drawn alone, relative to half the sampling frequency
 
-RANGE, ABOVE = 120.0, 30.0
-"""Most dB that an axis shows, and above the model: a zero on a grid point is no information, and a
-measured response at lines that the input does not excite is none."""
+RANGE = 120.0
+"""Most dB that an axis shows: a zero of a model on a grid point is no information."""
+
+ABOVE = 30.0
+"""Most dB above the model: a measured response at lines without excitation is no information."""
 
 STRETCHES = 200
 """Parts of the frequency axis: a variance is drawn as its mean over each. Line by line it hid the

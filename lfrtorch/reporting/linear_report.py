@@ -37,7 +37,7 @@ def figures(evaluation: Evaluation, frf: FRF | None, scan: OrderScan | None) -> 
 
 
 def numbers(evaluation: Evaluation, frf: FRF | None, scan: OrderScan | None) -> dict[str, Any]:
-    """What linear.json holds; None if a number is not finite or not known."""
+    """Contents of linear.json; None if a number is not finite or not known."""
     model = _model(evaluation)
     fit = model.fit
     assert fit is not None

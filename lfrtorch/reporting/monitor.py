@@ -1,4 +1,4 @@
-"""What a fit leaves while it runs: TensorBoard and checkpoints."""
+"""Monitors that write while a fit runs: TensorBoard and checkpoints."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class TensorBoard:
 
     @property
     def begun(self) -> bool:
-        """Whether something is written."""
+        """True if something is written."""
         return self._writer is not None
 
     def history(self, history: Sequence[Progress]) -> None:
@@ -158,7 +158,7 @@ def _add(writer: SummaryWriter, progress: Progress) -> None:
 
 
 def _file(writer: SummaryWriter) -> FileWriter:
-    """What takes summaries that are made already."""
+    """Writer of finished summaries."""
     assert writer.file_writer is not None
     return writer.file_writer
 

@@ -42,7 +42,7 @@ def opponents(
         records: that linear models are estimated from.
         dataset: whose training, validation and selection records choose.
         nx: order.
-        options: of :func:`lfrtorch.estimate_bla`.
+        options: arguments of :func:`lfrtorch.estimate_bla`.
         ahead: horizons of the predictions that are judged; none of simulations alone.
     """
     wanted: list[Criterion] = ["simulation"] if not ahead else ["prediction", "simulation"]

@@ -1,4 +1,4 @@
-"""What a run was made from and where: checksums of its records, the machine, the caller's code."""
+"""Origin of a run: checksums of its records, the machine, the caller's code."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def git_state() -> dict[str, Any] | None:
 
 
 def _git(*words: str) -> str | None:
-    """What git says, None if it cannot."""
+    """Output of git; None if it fails."""
     try:
         done = subprocess.run(
             ["git", *words], capture_output=True, text=True, check=True, timeout=10

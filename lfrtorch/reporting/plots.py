@@ -45,7 +45,7 @@ Simulated = Mapping[str, Array]
 """Outputs by the name of their model; a linear one's begins with ``linear``."""
 
 COLOURS = tuple(colour for colour in CHANNELS if colour != LINEAR)
-"""Of the models that are not linear; there are no more of them in a figure."""
+"""Colours of the nonlinear models, which are also the most in a figure."""
 
 _HEIGHT = 4.2  # of an output in a figure, in inches
 _INPUTS, _MOST_INPUTS = 1.6, 5  # height of the inputs above, and how many are drawn
@@ -53,7 +53,7 @@ _WIDE, _NARROW = 6.4, 4.4  # of figures that stand side by side on a wide page
 
 
 def is_whole(record: Record) -> bool:
-    """Whether the scored samples are whole periods in steady state, without leakage."""
+    """Tell if the scored samples are whole periods in steady state, without leakage."""
     return record.start == "periodic" and not record.skip
 
 
@@ -271,7 +271,7 @@ def _overlay(
 
 
 def _fit_text(y: Array, y_hat: Array) -> str:
-    """How well a simulation follows one output: 100 % - NRMSE, to two digits of the NRMSE."""
+    """Fit of a simulation to one output: 100 % - NRMSE, to two digits of the NRMSE."""
     missing = 100 * float(rms(y - y_hat)) / (float(np.std(y)) or np.nan)
     if not np.isfinite(missing):
         return "diverges" if not np.isfinite(y_hat).all() else "no fit: constant"

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """What ``lfrtorch preview`` shows of a file; ``print`` has the numbers and the notes.
+    """Preview of a file by ``lfrtorch preview``; ``print`` has the numbers and the notes.
 
     Args:
         survey: the numbers of each signal.
-        notes: what would hurt a model, and what to do; empty if nothing was found.
+        notes: faults that would hurt a model, with remedies; empty if nothing was found.
         figure: each signal over time, its values, and its spectrum.
 
     Example:

@@ -27,24 +27,24 @@ from lfrtorch.reporting.verdict import Verdict
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Run:
-    """What :func:`lfrtorch.identify` returns; ``print(run)`` shows verdict and scores.
+    """Result of :func:`lfrtorch.identify`; ``print(run)`` shows verdict and scores.
 
     Args:
         dataset: the records.
-        settings: with the sizes that were chosen in the place of ``"auto"``.
+        settings: the settings, with the chosen sizes in place of ``"auto"``.
         linear: the best linear approximation of all training records.
-        order_scan, choice: how nx and the other sizes were chosen; None if they were given.
+        order_scan, choice: choice of nx and of the other sizes; None if they were given.
         fit: the nonlinear fit, of the best start or of the mean of several.
         refit: the fit to all estimation records, if one was asked for. Its model is the run's, and
             is scored on the tests; training and validation errors are those of ``fit.model``.
         evaluation: both models on every record.
-        residuals: of the record with the largest error, as the report shows them.
-        parameters: of the known model, if the settings have one.
-        memory: whether the simulation forgets where it began; None for fits to predictions and
+        residuals: analysis of the record with the largest error, as the report shows it.
+        parameters: parameters of the known model, if the settings have one.
+        memory: result of the test if the simulation forgets its start; None for predictions and
             windows.
-        metrics: what ``metrics.json`` holds: scores by record, sizes, the fit in numbers.
-        verdict: whether the NL-LFR is worth more than the linear model.
-        advice: what to try next, the most useful first.
+        metrics: contents of ``metrics.json``: scores by record, sizes, the fit in numbers.
+        verdict: comparison of the NL-LFR with the linear model.
+        advice: next steps, the most useful first.
 
     Example:
         >>> dataset = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[record[200:]])

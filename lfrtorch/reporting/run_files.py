@@ -30,10 +30,10 @@ def write(
     history.
 
     Args:
-        run: what :func:`lfrtorch.identify` returned.
-        folder: of the files; those of an earlier run there are replaced.
+        run: result of :func:`lfrtorch.identify`.
+        folder: folder of the files; those of an earlier run there are replaced.
         command, config: that made the run, for ``metrics.json`` and ``report.html``.
-        draw: whether figures and ``report.html`` are made.
+        draw: make figures and ``report.html``.
         board: TensorBoard, with the history if it has begun. Default: a new one.
     """
     folder = Path(folder)

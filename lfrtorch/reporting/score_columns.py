@@ -16,11 +16,11 @@ ALL = "all"
 """Name of several outputs together."""
 
 USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
-"""What the report says of a record's use."""
+"""Words of the report for the uses of records."""
 
 
 def use_of(use: str, record: str) -> str:
-    """What a record was for; what stands for validation in a cross-validation chose nothing."""
+    """Use of a record; the left out parts of a cross-validation chose nothing."""
     return "left out in turn" if record.endswith(CROSS) else USES.get(use, use)
 
 

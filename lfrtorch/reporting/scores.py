@@ -220,7 +220,7 @@ def starts(
 
 
 def stability(stable_to: float) -> str:
-    """How much louder the training inputs may be."""
+    """Amplitude margin of the training inputs."""
     tried = ", ".join(f"{factor:g}" for factor in LOUDER)
     if stable_to >= max(LOUDER):
         return (

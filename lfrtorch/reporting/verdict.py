@@ -5,7 +5,7 @@ same blocks of time, and the standard error of its logarithm. (That of the diffe
 few resonances have most of the error, even where one model is better in every block.) A ratio is
 clear if it is beyond Student's quantile, or if one error is twice the other: one burst of a model
 that runs away has a large standard error, and is no chance. A difference below 5 % of the error is
-none. What was left out in turn is the whole record, each stretch judged by models that were chosen
+none. Parts left out in turn are the whole record, each stretch judged by models that were chosen
 without it: there 2.25 standard errors and 1 % are enough (``benchmarks/first_try.md``). There one
 stretch in which a model runs away may have most of the error. It neither hides nor makes a verdict:
 the mean of the blocks' own log ratios, each of a factor 3 at most, has to point the same way, and
@@ -34,8 +34,14 @@ from lfrtorch.data.paired_blocks import BLOCKS, Judge, in_blocks
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.reporting.evaluation import CROSS, Response, has_settled, training_deviations
 
-NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"
-"""What a verdict says is to be used."""
+NL_LFR = "NL-LFR"
+"""Verdict to use the NL-LFR."""
+
+LINEAR_MODEL = "linear model"
+"""Verdict to use the linear model."""
+
+NEITHER = "neither"
+"""Verdict to use neither model."""
 
 SAME = 0.05
 """Difference of the errors, relative to the linear model's, below which neither is preferred."""
@@ -61,7 +67,7 @@ _LONGEST_NAME = 28  # characters of a record's name in a sentence
 
 
 class Kind(StrEnum):
-    """What a verdict comes to."""
+    """Kinds of verdicts."""
 
     BETTER = "better"
     """The NL-LFR is clearly better than the linear model on records that were not fitted."""
@@ -77,7 +83,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the NL-LFR is worth more than the linear model."""
+    """Comparison of the NL-LFR with the linear model."""
 
     kind: Kind  # what it comes to
     text: str  # in a sentence of 160 characters at most
@@ -125,13 +131,13 @@ class _Compared(NamedTuple):
 
     @property
     def worse(self) -> bool:
-        """Whether the NL-LFR's error is clearly larger."""
+        """True if the NL-LFR's error is clearly larger."""
         certain = self.deviations > self.clear or self.ratio >= _CLEAR
         return certain and self.ratio > 1.0 + SAME and not (self.cross and self.middle <= 1.0)
 
     @property
     def better(self) -> bool:
-        """Whether it is clearly smaller."""
+        """True if the NL-LFR's error is clearly smaller."""
         certain = self.deviations < -self.clear or self.ratio <= 1.0 / _CLEAR
         whole = certain and self.ratio < 1.0 - self.same
         # In cross-validation the runaway of one model in one stretch decides nothing.
@@ -484,7 +490,7 @@ def _numbers(compared: _Compared) -> dict[str, Any]:
 
 
 def _use(response: Response) -> str:
-    """What a record was for, in a sentence."""
+    """Use of a record, for a sentence."""
     return "training" if response.use == "train" else response.use
 
 
