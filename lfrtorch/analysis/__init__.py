@@ -1,4 +1,4 @@
-"""What a fitted model is, and how far it may be trusted: figure, residuals, bands, bounds."""
+"""Analysis of a fitted model and of its uncertainty: figure, residuals, bands, bounds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a model stays stable on louder inputs than those of its data."""
+"""Amplitude margin: stability of a model on louder inputs than those of its data."""
 
 from __future__ import annotations
 

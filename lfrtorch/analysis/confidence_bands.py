@@ -1,4 +1,4 @@
-"""How far a model's parameters are known, and what that means for what it says.
+"""Uncertainty of a model's parameters, and confidence bands of its outputs.
 
 At the end of a fit θ_hat - θ = H⁻¹ Jᵀe to first order, with J the weighted rows of the model's
 output, H = JᵀJ, and e the noise. So the covariance of θ_hat is a sandwich, H⁻¹ (JᵀΓJ) H⁻¹. Γ is the
@@ -59,7 +59,7 @@ _NEAR = 40.0
 """Deviations of the noise from a limit, within which it can reach that."""
 
 NOT_AT_MINIMUM = "the fit is not at its minimum"
-"""How a note begins that says so."""
+"""Beginning of the note on that shift."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class Band:
         std: standard deviation of y, as the parameters are not known exactly; a start state that
             is estimated from the record adds its own.
         noise: standard deviation of the measurement noise.
-        surprises: how far each sample is from what the data taught: 1 is as far as they went; 99 %
+        surprises: distance of each sample from the data: 1 is the extent of the data; 99 %
             of their samples are below. NaN if it is not known.
 
     Example:
@@ -100,7 +100,7 @@ class Band:
 
         Args:
             level: probability, 0 to 1.
-            noise: whether it shall hold the measured output, which has noise on it.
+            noise: include the noise of the measured output.
         """
         check_number("level", level)
         if not 0 < level < 1:
@@ -112,13 +112,13 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How far the parameters of a model are known; ``print(uncertainty)`` shows it.
+    """Uncertainty of the parameters of a model; ``print(uncertainty)`` shows it.
 
     Args:
         model: the model, in float64 on the CPU.
         records: names of the records that it was fitted to.
         samples: that were scored.
-        kept: which parameters vary, by their place among the free ones; the others are held, which
+        kept: parameters that vary, by their place among the free ones; the others are held, which
             changes no output.
         factor: F, so that F Fᵀ is the covariance of these.
         rank: directions of them that the data tell.
@@ -126,7 +126,7 @@ class Uncertainty:
         relative: mean standard deviation of the training outputs, over their rms.
         doubts: why the bands may be wrong; empty if nothing is known against them.
         colour: the noise over time, normalised.
-        reach: how far the data went.
+        reach: range of the data.
 
     Example:
         >>> found = lfrtorch.analysis.uncertainty(model, record)
@@ -263,7 +263,7 @@ class Uncertainty:
 
 @typed()
 def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty:
-    """How far the parameters of a model are known from the records that it was fitted to.
+    """Uncertainty of the parameters of a model, from the records that it was fitted to.
 
     The result simulates with bands and a surprise index, and gives linear models with covariance.
     It is computed again whenever it is needed: from ``lfrtorch.load(folder)`` and the same data.
@@ -273,7 +273,7 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
 
     Args:
         model: at the minimum of its fit.
-        records: what it was fitted to, with starts, skips and weights as in the fit.
+        records: records of the fit, with starts, skips and weights as in the fit.
 
     Raises:
         ValueError: a model that was fitted to predictions, other channels or another rate than the

@@ -13,8 +13,11 @@ from lfrtorch._support.types import Array
 from lfrtorch.data.records import Record
 from lfrtorch.linear.spectra import Spectra, spectra_of_periods
 
-_SEGMENT, SHORTEST = 4096, 16
-"""Most and fewest samples of a segment that a power spectral density is averaged over."""
+_SEGMENT = 4096
+"""Most samples of a segment of Welch's method."""
+
+SHORTEST = 16
+"""Fewest samples of a segment of Welch's method."""
 
 _STRETCHES = 256
 """Most frequencies of the density of noise, which is a mean over the lines about each."""
@@ -25,7 +28,7 @@ class Densities:
     """Power spectral densities in the output's unit squared per Hz.
 
     Args:
-        frequencies: of output and error, Hz.
+        frequencies: frequencies of output and error, Hz.
         output, error: measured output and error.
         noise_frequencies, noise: from the differences between periods, if the record repeats.
     """
@@ -85,7 +88,7 @@ def _noise_power(spectra: Spectra) -> Float[Array, "F ny"]:
 
 
 def _steady(record: Record, N: int) -> bool:
-    """Whether the differences between successive periods of N samples have the same power in time.
+    """Tell if differences between successive periods of N samples have the same power in time.
 
     The first of two periods may have a transient, which is no noise.
     """

@@ -31,9 +31,9 @@ class Gradients:
 
     Args:
         kept: the columns, by their place in θ.
-        fitted: whether an estimated start was fitted together with the parameters. Otherwise it
+        fitted: an estimated start was fitted together with the parameters. Otherwise it
             follows from the skipped samples, as in ``Model.simulate``.
-        hold: whether to keep the rows, rather than compute them at each pass.
+        hold: keep the rows, rather than compute them at each pass.
     """
 
     def __init__(

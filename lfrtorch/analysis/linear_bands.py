@@ -22,7 +22,7 @@ class ResponseBand:
     Args:
         frequencies: in Hz.
         response: complex.
-        covariance: of its real and imaginary part.
+        covariance: covariance of its real and imaginary part.
 
     Example:
         >>> band = lfrtorch.analysis.response_band(bla, [1.0, 10.0])
@@ -82,7 +82,7 @@ def response_band(model: LinearModel, frequencies: ArrayLike) -> ResponseBand:
     """Frequency response with its covariance.
 
     Args:
-        model: with a covariance, as ``Uncertainty.linearise`` or ``estimate_bla`` gives it.
+        model: a model with a covariance, as ``Uncertainty.linearise`` or ``estimate_bla`` gives it.
         frequencies: (F,) in Hz.
 
     Raises:
@@ -104,7 +104,7 @@ def pole_bands(model: LinearModel) -> tuple[PoleBand, ...]:
     say little.
 
     Args:
-        model: with a covariance, as ``Uncertainty.linearise`` or ``estimate_bla`` gives it.
+        model: a model with a covariance, as ``Uncertainty.linearise`` or ``estimate_bla`` gives it.
 
     Raises:
         ValueError: a model without covariance.

@@ -27,7 +27,7 @@ def linearise(
 ) -> LinearModel:
     """The model linearised about an operating point, in physical units.
 
-    With u0 and the state x0 that it holds the model in, x0 = f(x0, u0), the deviations obey::
+    Let u0 hold the model in the state x0, x0 = f(x0, u0). The deviations obey::
 
         x+ = A x + B (u - u0) + K e
         y  = C x + D (u - u0) + y0 + e

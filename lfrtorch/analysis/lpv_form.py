@@ -1,7 +1,7 @@
 """The model as one that is linear in x and u and varies with parameters: the exact LPV form.
 
-With z - z0 = ζ the static map is f(z) = f(z0) + Δ(ζ) ζ, Δ = ∫ f'(z0 + t ζ) dt over t from 0 to 1.
-Of a network it is Δ = Ww diag(s) Wz with the mean slopes s = (σ(v0 + d) - σ(v0)) / d of the neurons
+Let z - z0 = ζ. The static map is f(z) = f(z0) + Δ(ζ) ζ, Δ = ∫ f'(z0 + t ζ) dt over t from 0 to 1.
+A network has Δ = Ww diag(s) Wz with the mean slopes s = (σ(v0 + d) - σ(v0)) / d of the neurons
 between v0 and v0 + d, d = Wz ζ. A mean slope lies between the least and the largest slope, so the
 parameters of the form are bounded.
 """
@@ -48,7 +48,7 @@ class LPV:
     Args:
         A, B, C, D: matrices; the first axis counts the parameters from 1.
         bounds: least and largest value of each p, whatever x and u; infinite if none is known.
-        schedule: what p are: ``"neurons"`` or ``"map"``.
+        schedule: kind of p: ``"neurons"`` or ``"map"``.
         x0, u0, x_next0, y0: the point that deviations are counted from, with the next state and the
             output there.
         Cz, Dzu: z - z0 = Cz (x - x0) + Dzu (u - u0).
@@ -174,7 +174,7 @@ def lpv(
         u: constant input u0. Default: the inputs' offsets in the data.
         x: state x0 in the model's coordinates. Default: the one at rest under u0, so that the form
             has no constant terms; 0 if there is none.
-        schedule: what p are. ``"neurons"``: the mean slope of each neuron of a network.
+        schedule: kind of p. ``"neurons"``: the mean slope of each neuron of a network.
             ``"map"``: the entries of Δ, by rows (w1 z1, w1 z2, .., w2 z1, ..), of any static map; a
             network with fewer of them than neurons is better off with them. Default: the neurons of
             a network, the map of others.

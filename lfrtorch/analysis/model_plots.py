@@ -42,8 +42,11 @@ _MOST_MAPS = 4
 _GRID = 121
 """Points of a curve, and of each side of a plane."""
 
-_HEIGHT, _LEAST_HEIGHT = 2.7, 3.6
-"""Height of a panel, and least height of the figure, in inches."""
+_HEIGHT = 2.7
+"""Height of a panel, in inches."""
+
+_LEAST_HEIGHT = 3.6
+"""Least height of the figure, in inches."""
 
 
 class _Visited(NamedTuple):
@@ -180,7 +183,7 @@ def _poles(part: SubFigure, systems: Mapping[str, LinearModel]) -> None:
 
 
 def _maps(part: Figure | SubFigure, static: StaticMap, where: _Visited, count: int) -> None:
-    """What the static map is beyond an affine one, a panel for each w."""
+    """Nonlinear part of the static map, a panel for each w."""
     z, nz = where.z, where.z.shape[1]
     low, high = z.min(axis=0), z.max(axis=0)
     columns = 1 if count == 1 else 2

@@ -29,8 +29,11 @@ LEAST = 0.1
 _NO_POWER = 1e-24
 """Power of prediction errors over the residuals' power, below which it is rounding."""
 
-_FADED, _LONGEST = 1e-4, 2048
-"""An impulse response ends where so little is left of it, and after so many samples."""
+_FADED = 1e-4
+"""Part of an impulse response below which it ends."""
+
+_LONGEST = 2048
+"""Most samples of an impulse response."""
 
 
 class Spectra:

@@ -44,12 +44,12 @@ class OutputResiduals:
         fit: 100 (1 - |y - y_hat| / |y - mean y|) in %, as MATLAB's ``compare`` gives it; NaN for a
             constant output.
         whiteness: correlation of the error with its own past.
-        linear: of the error with each input.
-        even: of the error with the square of each input: even nonlinearities that are left.
-        odd: of error times simulated output with the square of each input: odd ones, or a gain.
+        linear: correlation of the error with each input.
+        even: correlation with the square of each input: even nonlinearities that are left.
+        odd: the same for error times simulated output: odd ones that are left, or a gain.
         densities: spectra of output, error and noise.
         noise: standard deviation of the noise, if the record repeats.
-        exact: whether the error is one of rounding.
+        exact: True if the error is one of rounding.
     """
 
     record: str
@@ -78,7 +78,7 @@ class OutputResiduals:
 
     @property
     def diverges(self) -> bool:
-        """Whether the simulation is not finite."""
+        """True if the simulation is not finite."""
         return not bool(np.isfinite(self.error).all())
 
     @property
@@ -98,7 +98,7 @@ class OutputResiduals:
 
     @property
     def verdict(self) -> str:
-        """What the tests find in the error, as a sentence."""
+        """Result of the tests of the error, as a sentence."""
         if self.diverges:
             return "the simulation diverges"
         if self.exact:

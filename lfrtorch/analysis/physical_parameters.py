@@ -32,12 +32,12 @@ class PhysicalParameters:
     """Parameters of a known model in their units; ``print(found)`` shows them with notes.
 
     Args:
-        names, units: of the parameters.
+        names, units: names and units of the parameters.
         values: as fitted.
         errors: standard errors, of noise that may have a colour; NaN if they are not known.
-        correlation: of the estimates.
+        correlation: correlation of the estimates.
         alone: standard errors if the learned part were known, as far as that has a meaning.
-        notes: what to know of them; empty if there is nothing.
+        notes: remarks on them; empty if there are none.
 
     Shape:
         values, errors, alone: (n,), correlation: (n, n).
@@ -88,8 +88,8 @@ def physical_parameters(
     the learned part can say as well as a parameter makes its error large.
 
     Args:
-        model: with a known model.
-        records: what it was fitted to, with starts, skips and weights as in the fit.
+        model: a model with known equations.
+        records: records of the fit, with starts, skips and weights as in the fit.
         ridge: that of the fit; as it says how far parameters may be from where the search began, it
             tells apart what the data do not.
 
@@ -159,7 +159,7 @@ def _notes(
     *,
     learned: bool,
 ) -> list[str]:
-    """What the data cannot tell apart."""
+    """Parameters that the data cannot separate."""
     found = []
     pairs = np.argwhere(np.triu(np.abs(correlation) > _ALIKE, 1))
     if len(pairs):

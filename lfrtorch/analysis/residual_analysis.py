@@ -153,7 +153,7 @@ def residuals(
     Args:
         model: nonlinear or linear.
         records: one or several.
-        lags: of the correlations. Default: 25, fewer in less than 1000 samples.
+        lags: lags of the correlations. Default: 25, fewer in less than 1000 samples.
 
     Raises:
         ValueError: a record of other channels or another rate than the model's, or of less than 20

@@ -1,4 +1,4 @@
-"""What an uncertain start state adds to the errors of a simulation.
+"""Part of the errors of a simulation by an uncertain start state.
 
 The start state is fitted to the first N samples of a record, with the covariance P of the states
 over the training data as a prior. Let S be the free responses of those outputs to the states

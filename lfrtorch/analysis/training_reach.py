@@ -1,4 +1,4 @@
-"""How far training data went, and how far beyond them other samples are: the surprise index."""
+"""Range of training data, and distance of other samples from them: the surprise index."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lfrtorch.model.data_reach import FARTHEST, Cloud
 
 @dataclass(frozen=True, eq=False)
 class TrainingReach:
-    """How far the training data went: in the static map's input z, and in what they tell of y.
+    """Range of the training data in the static map's input z, and in the uncertainty of y.
 
     Two distances count, whichever is larger, each relative to the one of 99 % of the training
     samples: of z from the middle of its cloud, in standard deviations of the cloud, and the

@@ -32,7 +32,7 @@ class Trim:
         x: state in the model's coordinates.
         u, y: input and output, physical units.
         residual: y less the output that was asked for, 0 where none was.
-        outside: what the data of the fit did not reach of it, in words; empty if they reached all.
+        outside: parts that the data of the fit did not reach, in words; empty if they reached all.
 
     Example:
         >>> found = lfrtorch.analysis.trim(model, u=0.5)
@@ -58,7 +58,7 @@ def trim(
     """The state and the input at which a model rests with given outputs and inputs.
 
     By least squares: if no rest has these outputs, it is the one whose outputs, over their scales,
-    are nearest to them, and ``residual`` says how far they are. Of several inputs that do as well
+    are nearest to them, and ``residual`` says how far they are. If several inputs do as well,
     it is the one nearest to the offsets of the data. Integrators are at rest, too.
 
     Args:
