@@ -65,7 +65,7 @@ def tidy(folder: Path) -> None:
 
 
 def locked(folder: Path) -> bool:
-    """Whether the folder is this program's alone now; where the system has no locks, as if."""
+    """Tell if the folder belongs to this program alone; True where the system has no locks."""
     try:
         import fcntl
     except ImportError:

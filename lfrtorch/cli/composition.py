@@ -27,7 +27,7 @@ from lfrtorch.files.excel import workbook
 from lfrtorch.files.formats import FORMATS, extension, similar
 
 GROUPS = ("bla", "frf", "data", "trainer")
-"""Groups whose words are arguments of functions. Of a name in several, the last one is meant."""
+"""Groups whose words are arguments of functions. A name in several means the last one."""
 
 declared.register()
 
@@ -109,7 +109,7 @@ def with_names(given: Sequence[str]) -> list[str]:
 
 
 def _may_be_file(word: str) -> bool:
-    """Whether a word is a file, a pattern of files, or called as a file of measurements is."""
+    """Tell if a word is a file, a pattern of files, or has the name of a measurement file."""
     path, _ = workbook(expanded(word))
     if path.is_dir() or ("=" in word and not path.exists()):
         return False
@@ -210,7 +210,7 @@ def several_values(word: Override, cfg: DictConfig) -> str:
 
 
 def is_choice(word: Override) -> bool:
-    """Whether it chooses an option of a group, of ours or of Hydra."""
+    """Tell if a word chooses an option of a group, of ours or of Hydra."""
     return (CONF / word.key_or_group).is_dir() or word.is_hydra_override()
 
 
@@ -245,12 +245,12 @@ def _composed(folder: Path, command: str, words: tuple[str, ...]) -> DictConfig:
 
 
 def adds(word: Override) -> bool:
-    """Whether it is +NAME or ++NAME."""
+    """Tell if a word is +NAME or ++NAME."""
     return word.is_add() or word.is_force_add()
 
 
 def taken(word: Override, cfg: DictConfig) -> bool:
-    """Whether something reads the setting: one that is there, or an argument that is added."""
+    """Tell if a setting is read: it exists, or it is an added argument."""
     group, _, name = word.key_or_group.rpartition(".")
     top = group.split(".")[0]
     if adds(word) and group and (top in cfg or (CONF / top).is_dir()):
@@ -262,7 +262,7 @@ def taken(word: Override, cfg: DictConfig) -> bool:
 
 
 def unknown(command: str, word: Override, cfg: DictConfig) -> str:
-    """What to write for a setting that there is not."""
+    """Proposal for a setting that does not exist."""
     key = word.key_or_group
     _, value = str(word.input_line).split("=", 1)
     if command in _DATA_CHOSEN and cfg.get("data") is None and key.startswith("data."):
@@ -286,7 +286,7 @@ def _with_data(command: str, cfg: DictConfig) -> DictConfig:
 
 
 def spelt(cfg: DictConfig) -> Iterator[tuple[str, str]]:
-    """What a user may write for a setting, and the word of the command line."""
+    """Names that a user may write for a setting, and its word on the command line."""
     # Of a name in several groups the last of ``GROUPS`` is meant, above all groups that without
     # one.
     groups = [name for name, node in cfg.items() if isinstance(node, DictConfig)]

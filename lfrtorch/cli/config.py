@@ -55,7 +55,7 @@ def own_map(cfg: DictConfig, nz: int, nw: int) -> Module:
 
 
 def users_own(node: Any, **options: Any) -> Any:
-    """What a target of the user's own makes; its module may stand in the working directory."""
+    """Call a target of the user's own; its module may stand in the working directory."""
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     return instantiate(node, **options)

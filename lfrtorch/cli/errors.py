@@ -59,14 +59,14 @@ def _where(error: BaseException) -> str:
 
 
 def _of_the_settings(error: BaseException) -> bool:
-    """Whether a call from the configuration failed because of what it was given."""
+    """Tell if a call from the configuration failed because of its arguments."""
     called = any(note.startswith(NODE) for note in notes_of(error))
     wrong = "unexpected keyword argument" in str(error)
     return called and (isinstance(error, ImportError) or (isinstance(error, TypeError) and wrong))
 
 
 def _of_memory(error: BaseException) -> bool:
-    """Whether there was not enough memory; torch says so with a RuntimeError."""
+    """Tell if memory was too small, which torch reports as a RuntimeError."""
     return isinstance(error, MemoryError) or (
         isinstance(error, RuntimeError) and "memory" in str(error) and "alloc" in str(error)
     )

@@ -83,7 +83,7 @@ def from_files(cfg: DictConfig, model: lfrtorch.Model, command: str) -> None:
 
 
 def fitted(checkpoint: str, path: str | list[str]) -> bool:
-    """Whether the run that made the checkpoint has one of the files among its own."""
+    """Tell if the run of the checkpoint used one of the files."""
     folder = Path(checkpoint)
     for config in (folder / CONFIG, folder.parent / CONFIG):
         if config.is_file():

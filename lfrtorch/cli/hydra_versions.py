@@ -1,4 +1,4 @@
-"""What Hydra 1.4 asks for and Hydra 1.3 does not know."""
+"""Arguments that Hydra 1.4 requires and Hydra 1.3 does not know."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from hydra.errors import InstantiationException
 IS_1_3 = version("hydra-core").startswith("1.3")
 
 NODE = "full_key: "
-"""How the note on an error begins that says which node of the settings it is from."""
+"""Beginning of the note on an error that names its node of the settings."""
 
 COMPOSED: dict[str, Any] = {"version_base": "1.3"} if IS_1_3 else {}
-"""How ``initialize_config_dir`` reads the settings."""
+"""Arguments of ``initialize_config_dir``."""
 
 _TRUSTED = None if IS_1_3 else getattr(hydra.utils, "UNSAFE_DISABLE_EXECUTION_CHECKS", None)
 # Targets come from the settings in conf/ and from the user's command line, never from data or a
 # checkpoint; a static map of the user's own may be of any module.
 
 MAIN: dict[str, Any] = COMPOSED if _TRUSTED is None else {"execution_whitelist": _TRUSTED}
-"""How ``hydra.main`` reads the settings, and which targets in them it may call: all."""
+"""Arguments of ``hydra.main``, which may call all targets in the settings."""
 
 
 def instantiate(node: Any, *args: Any, **options: Any) -> Any:
-    """What a node of the settings describes; errors get a note, ``full_key: data``."""
+    """Instantiate a node of the settings; errors get a note, ``full_key: data``."""
     if _TRUSTED is not None:
         options["_execution_whitelist_"] = _TRUSTED
     try:
@@ -41,5 +41,5 @@ def instantiate(node: Any, *args: Any, **options: Any) -> Any:
 
 
 def notes_of(error: BaseException) -> list[str]:
-    """What was added to an error."""
+    """Notes that were added to an error."""
     return getattr(error, "__notes__", [])

@@ -84,7 +84,7 @@ class Termination:
         self._handled.__exit__(None, None, None)
 
     def __call__(self) -> bool:
-        """Whether the fit is to end."""
+        """True if the fit is to end."""
         self._fitting = True
         return bool(self.asked)
 

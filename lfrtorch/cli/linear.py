@@ -79,7 +79,7 @@ def response(
 
 
 def wants_response(cfg: DictConfig, records: Sequence[lfrtorch.Record]) -> bool:
-    """Whether the model is fitted to the measured frequency response."""
+    """Tell if the model is fitted to the measured frequency response."""
     return cfg.bla.refine == "frequency" or (cfg.bla.refine is None and of_response(records))
 
 

@@ -18,9 +18,14 @@ from omegaconf.errors import OmegaConfBaseException
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.paths import expanded
 
-CONFIG, SNAPSHOTS, STARTS = "config.yaml", "resume", "starts"
-"""In the folder of a run: its settings, its starts as far as they came, and events of those that go
-to the end."""
+CONFIG = "config.yaml"
+"""Settings of a run, in its folder."""
+
+SNAPSHOTS = "resume"
+"""Snapshots of the starts of a run, in its folder."""
+
+STARTS = "starts"
+"""Events of the starts that go to the end, in the folder of a run."""
 
 USED = "used"
 """In the settings there: the numbers that the fit has chosen, or was given."""
@@ -77,7 +82,7 @@ def words_of(folder: str | Path, given: Sequence[str] = ()) -> list[str]:
 
 
 def read_settings(path: Path) -> Any:
-    """What a YAML file of a run's folder holds, if it is whole and has no aliases."""
+    """Contents of a YAML file in a run's folder, if it is whole and has no aliases."""
     try:
         text = path.read_text(encoding="utf-8")
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
@@ -115,7 +120,7 @@ def program(script: str) -> list[str]:
 
 
 def go_on(folder: Path) -> str:
-    """How to go on with a run that ended early."""
+    """Command that continues a run that ended early."""
     return f"to go on: {shlex.join(program('train.py'))} resume={folder}"
 
 

@@ -23,7 +23,7 @@ LAUNCHERS = {
     "submitit_local": "hydra_plugins.hydra_submitit_launcher",
     "submitit_slurm": "hydra_plugins.hydra_submitit_launcher",
 }
-"""What starts several runs at once, and the package that it needs."""
+"""Launchers of several runs at once, and the packages that they need."""
 
 
 class RunFailedError(LfrtorchError):
