@@ -112,12 +112,12 @@ def estimate_bla(
             of another model, so that the initial state is estimated instead.
         nx: order.
         refine: the error. Default: see above.
-        weight: of the errors of a response: one over its ``"total"`` or ``"noise"`` variance,
+        weight: weight of a response's errors: one over its ``"total"`` or ``"noise"`` variance,
             ``"none"``, or own weights. Default: none for periodic data, as that model simulates
             best; the total variance for others, whose input has lines of little power; with
             integrators the total or the noise variance if one is known.
-        offset: whether constants are removed and stored as operating point.
-        feedthrough: whether the input acts on the output at once; otherwise D is 0, as it must be
+        offset: remove constants and store them as operating point.
+        feedthrough: the input acts on the output at once; otherwise D is 0, as it must be
             for data under feedback, which a prediction fits without bias.
         integrators: poles at z = 1 behind each output, exactly: 1 from a speed to a position, 2
             from a force without friction; or a list with 0 or 1 for each output, ``[1, 0]`` for a

@@ -1,7 +1,7 @@
 """Nonparametric best linear approximation: frequency response, noise and nonlinear distortion.
 
 The best linear approximation (BLA) of a nonlinear system is the linear system whose output is
-nearest to its own, for inputs of one spectrum. What it does not explain is of two kinds. Noise
+nearest to its own, for inputs of one spectrum. The unexplained rest is of two kinds. Noise
 changes from period to period of the same input. Nonlinear distortion is the same in every period,
 but looks like noise over frequency and changes from one realisation of the input to the next. So
 periods and realisations together tell how much of an error is noise, and how much a nonlinear model
@@ -49,8 +49,8 @@ class Level:
     period, so that the powers of all lines add up to the variance of the signal.
 
     Args:
-        frequencies: of the lines, Hz.
-        power: of the mean over the periods, as a mean over the records.
+        frequencies: frequencies of the lines, Hz.
+        power: power of the mean over the periods, as a mean over the records.
         noise: the power that the disturbing noise is expected to have in it.
     """
 
@@ -94,11 +94,11 @@ class FRF:
         cov_noise: covariance due to the disturbing noise, ``None`` if not available.
         cov_total: covariance due to noise and stochastic nonlinear distortion together, likewise.
         experiments: number of records, those of one realisation together.
-        periods: of the experiment with the fewest; 1 without periods.
+        periods: periods of the experiment with the fewest; 1 without periods.
         method: ``"robust"``, ``"fast"`` or ``"local_polynomial"``.
         distortion: levels at the output, from the fast method alone.
-        notes: what is not available, why, and what would give it.
-        errors: of local polynomials, whose windows share lines: how the errors of all lines follow
+        notes: results that are not available, with the reason and a remedy.
+        errors: map of the errors of local polynomials, whose windows share lines: these follow
             from independent ones.
 
     Example:
@@ -172,8 +172,8 @@ def estimate_frf(
 
     ``"robust"``: the records are experiments with one period length, in steady state after
     ``skip``; the last whole periods of each are used. G is the least-squares fit of the spectra
-    over the experiments (one input: the mean of their ratios weighted by input power). What
-    changes from period to period is noise; what changes from experiment to experiment is noise and
+    over the experiments (one input: the mean of their ratios weighted by input power). The
+    scatter from period to period is noise; the scatter over experiments is noise and
     distortion. Experiments weigh equally, whatever their number of periods. The total covariance
     comes from the scatter of the blocks of nu experiments if these are orthogonal multisines, and
     else from the residuals, as if these had one covariance in all experiments.
@@ -203,7 +203,7 @@ def estimate_frf(
         lines: numbers (F,) of DFT lines of the period (of the record, for local polynomials),
             0 < line < N / 2. Default: those that are excited. The fast method needs all of these.
         band: lowest and highest frequency in Hz. Default: all lines.
-        order: of the local polynomials.
+        order: order of the local polynomials.
 
     Raises:
         ValueError: a constant input, records of different periods or without, an input that does
@@ -434,7 +434,7 @@ def _response(spectra: Spectra, lines: Integers) -> Regression:
 def _without_noise(fitted: Regression, spectra: Spectra, lines: Integers) -> Regression:
     """Least squares of noisy inputs without the bias that their noise has.
 
-    Of R experiments as many as there are inputs fit exactly, whatever the noise; the others leave
+    As many of R experiments as there are inputs fit exactly, whatever the noise; the others leave
     its share (R - nu) / R in UᴴU and UᴴY, which is subtracted, to first order in the noise.
     """
     U, Y = spectra.U[lines], spectra.Y[lines]

@@ -8,10 +8,10 @@ put back behind them:
     x+ = A x + B u,   s₁+ = s₁ + C x + D u,   s₂+ = s₂ + s₁ + Q₁ u,   ...   y = sₙ + Qₙ u.
 
 The difference turns white noise of y into blue noise, and errors that the system has integrated,
-such as those of friction, into white noise. With both of them the error of the difference is a
+such as those of friction, into white noise. Both together make the error of the difference a
 moving average 1 - λ z⁻¹ of white noise. All signals are filtered by 1 / (1 - λ z⁻¹), which whitens
 the error and leaves G₁ as it is: with λ = 0 the fit is to the difference, with λ near 1 to the
-output itself. What the filters hold at the beginning is not known. It adds λᵏ to the output, whose
+output itself. The initial state of the filters is not known. It adds λᵏ to the output, whose
 size is a parameter.
 
 Some outputs may have one integrator and others none, as a position and a speed do. Only the former
@@ -59,7 +59,7 @@ def integrators_of(integrators: int | Sequence[int], ny: int) -> tuple[int, ...]
 def without_limits(record: Record, integrates: Bool[Booleans, " ny"]) -> Record:
     """Return a record whose outputs that integrate are not valid where they are at a limit.
 
-    How far beyond it they are is not known, so nothing is known of their differences.
+    Their distance beyond it is not known, and so neither are their differences.
     """
     if record.limits is None or record.start == "periodic":
         return record
@@ -216,7 +216,7 @@ def gain(records: Sequence[Record], *, offset: bool) -> LinearModel:
 
 
 def scored(records: Sequence[Record]) -> Booleans:
-    """Which outputs of all records count, after the skipped samples."""
+    """Mask of the outputs of all records that count, after the skipped samples."""
     return np.concatenate([record.scored[record.skip :] for record in records])
 
 

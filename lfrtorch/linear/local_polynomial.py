@@ -30,8 +30,8 @@ FOLLOWING = 10.0
 The ratio of the responses of y and u has a bias of exp(-10) there."""
 
 STRONGER = 100.0
-"""Power of the input at lines that tell the noise at a weaker one, relative to it: 20 dB. With
-10 dB the models of chirps and steps in a loop are as good."""
+"""Power of the input at lines that tell the noise at a weaker one, relative to it: 20 dB. The
+models of chirps and steps in a loop are as good by 10 dB."""
 
 CHUNK = 2**21
 """Complex numbers of the windows that are in memory at a time: 32 MiB, and as many in copies."""
@@ -120,9 +120,9 @@ def fit_local_polynomials(
     the same for all windows, removes t. The result is g_0 = G(k).
 
     Where nothing else excites the input, a controller makes it from the noise. There G becomes one
-    over the controller and leaves no residual, which so tells nothing of the error. With a
-    reference (as U; Y holds ``outputs``, then the inputs) these lines are not determined. Without
-    one the noise where the input is weak is at least that where it is strong, times the lines of a
+    over the controller and leaves no residual, which so tells nothing of the error. A
+    reference (as U; Y holds ``outputs``, then the inputs) leaves these lines undetermined. If there
+    is none, the noise at a weak input is at least that at a strong one, times the lines of a
     window, as what the controller makes is common to them.
 
     References:

@@ -11,7 +11,7 @@ from lfrtorch.data.records import Record, Scaler
 from lfrtorch.linear.model import LinearFit, LinearModel
 
 _RIDGE = 1e-9
-"""Of the squares of regressors of unit rms: it holds the weight of one that does not vary at 0."""
+"""Ridge relative to regressors of unit rms: it holds the weight of a constant one at 0."""
 
 
 def measured_states_model(records: Sequence[Record]) -> LinearModel:

@@ -1,6 +1,6 @@
 """Jacobian of a response by its modes: for many states, inputs and outputs.
 
-With A = V Λ V⁻¹, b = V⁻¹ B and c = C V the response is a sum over modes,
+Let A = V Λ V⁻¹, b = V⁻¹ B and c = C V. The response is a sum over modes,
 G(z) = Σ cᵢ bᵢ / (z - λᵢ) + D. All derivatives with λ, b, c and D are 1, 1 / (z - λᵢ) or
 1 / (z - λᵢ)², times constants. So JᴴJ needs the products of 2 nx + 1 functions summed over the
 lines, and constants: no J. The first-order change of λ, b and c with A, B, C is known; its rows

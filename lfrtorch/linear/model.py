@@ -34,18 +34,18 @@ from lfrtorch.model.model import Model, read_model, write_model
 
 @dataclass(frozen=True)
 class LinearFit:
-    """How a linear model was found.
+    """Record of the fit of a linear model.
 
     Args:
         criterion: ``"simulation"``, ``"prediction"`` or ``"frequency"``.
         rmse: root mean squared error of the criterion over the data, in normalised units: of
             outputs of unit rms, or of weighted responses.
-        iterations: of the refinement.
+        iterations: iterations of the refinement.
         reason: why it ended.
         seconds: duration of the estimation.
-        singular_values: of the subspace, relative to the size of the outputs: they drop after the
+        singular_values: those of the subspace, relative to the outputs' size: they drop after the
             order that the data carry.
-        notes: what a user should know about data and result.
+        notes: remarks on data and result for the user.
 
     Example:
         >>> fit = bla.fit
@@ -77,13 +77,13 @@ class LinearModel:
         u_offset, y_offset: operating point.
         inputs, outputs: channel names and units.
         K: gain of the innovations e. Default: no noise model.
-        innovation_covariance: of e. Default: no noise model.
+        innovation_covariance: covariance of e. Default: no noise model.
         state_covariance: E x xᵀ over the training data, about 0. Default: not known.
-        covariance: of the P = (nx + ny) (nx + nu) entries of A, B, C and D, row by row, one matrix
-            after another. Default: not known.
-        fit: how the model was found.
+        covariance: that of the P = (nx + ny) (nx + nu) entries of A, B, C and D, row by row, one
+            matrix after another. Default: not known.
+        fit: record of the fit.
         x_offset: state of the nonlinear model that x = 0 stands for, if it is linearised.
-        outside: what the data did not reach of that state and of its input, in words.
+        outside: parts of that state and of its input that the data did not reach, in words.
 
     Example:
         >>> bla
@@ -227,13 +227,13 @@ def _scaled(model: LinearModel, record: Record) -> Model:
 _KNOWN = {
     "covariance": "PP", "innovation_covariance": "yy", "state_covariance": "xx", "x_offset": "x",
 }  # fmt: skip
-"""What else is known of a linear model, in its checkpoint, and its axes."""
+"""Further arrays of a linear model in its checkpoint, with their axes."""
 
 
 def _known(
     folder: str | Path, model: Model, about: Any, known: Mapping[str, Tensor]
 ) -> dict[str, Any]:
-    """What a checkpoint says of a linear model beside its numbers."""
+    """Description of a linear model in a checkpoint, beside its numbers."""
     cell = model.lfr.cell
     if cell.nw:
         raise InputError(f"'{folder}' holds no linear model; lfrtorch.load reads an NL-LFR.")

@@ -22,7 +22,7 @@ from lfrtorch.linear.balancing import balancing
 from lfrtorch.linear.model import LinearModel
 
 MINOR = 1 / 3
-"""Largest share in the output that counts as minor. Of the linear models of Bouc-Wen,
+"""Largest share in the output that counts as minor. In the linear models of Bouc-Wen,
 Wiener-Hammerstein, Silverbox and the parallel Wiener-Hammerstein stand-in (orders 2 to 12, 10
 realisations) spurious modes have 0.01 to 0.29, the others 0.40 and more."""
 

@@ -39,15 +39,18 @@ Window = tuple[int, int]
 _MOST_STEPS = 80
 """Iterations of a search."""
 
-_SETTLED, _STRIDE = 1e-4, 4
-"""The search ends if _STRIDE iterations lower the cost by less than the part _SETTLED."""
+_SETTLED = 1e-4
+"""Relative decrease of the cost over ``_STRIDE`` iterations below which the search ends."""
+
+_STRIDE = 4
+"""Iterations between two checks of the decrease."""
 
 
 def description_length(rmse: float, parameters: int, equations: float) -> float:
     """Return the error times M^(p / 2M), for p parameters and M independent equations.
 
     Its logarithm is the description length M ln V + p ln M of a mean square V, over 2M (Rissanen,
-    Automatica 14, 1978). With the usual √(1 + p ln M / M) the true order was chosen in 13 of 20
+    Automatica 14, 1978). The usual √(1 + p ln M / M) chose the true order in 13 of 20
     cases as against 18.
     """
     return rmse * equations ** (parameters / (2.0 * equations))

@@ -55,13 +55,13 @@ class OrderScan:
 
     Args:
         models: one for each order; that of the order chosen is a full estimate.
-        scores: of each order. With validation records the rms of the simulation error over them,
+        scores: scores of the orders. With validation records the rms of the simulation error there,
             each output relative to its rms; in a cross-validation over them and the training
-            records. Without them the error of the fit, times M^(p / 2M) for p parameters,
+            records. Otherwise the error of the fit, times M^(p / 2M) for p parameters,
             initial states among them, and M independent equations (minimum description length).
             The fit of periodic records is to their mean periods, whose error is less than that of
             their samples.
-        validated: whether validation records give the scores.
+        validated: validation records give the scores.
         chosen: the lowest order whose score is within one standard error of the best, 5 % at most,
             or within 1 %; without validation records the order of the best score.
         notes: why the scores are those of a cross-validation, and what orders were left out.
@@ -128,7 +128,7 @@ def scan_orders(
             others.
         validation: records that choose the order.
         watch: called with a line after each order.
-        options: of ``estimate_bla``.
+        options: arguments of ``estimate_bla``.
 
     Raises:
         ValueError: no order, or too few data for any of them.

@@ -2,7 +2,7 @@
 
 A resonance that is narrower than the lines are apart fits one of them, and a resonance outside the
 excited band that is much narrower than its distance from it fits the band's edge: the lines do not
-tell how narrow. With a pole e^(-h + jω), of half-power width 2h, the limit is
+tell how narrow. A pole e^(-h + jω), of half-power width 2h, has the limit
 
     h >= m(ω) = max(half the distance of the lines, REACH times that of ω from the nearest one).
 
@@ -20,7 +20,7 @@ from jaxtyping import Complex128, Float
 from lfrtorch._support.types import Array, Complex
 
 PART = 0.1
-"""What a pole far beyond its limit adds to the squared error, relative to it."""
+"""Penalty of a pole far beyond its limit, relative to the squared error."""
 
 REACH = 1 / 3
 """Half width of a pole outside the band, relative to its distance from it. The real pole of

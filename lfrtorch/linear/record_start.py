@@ -1,4 +1,4 @@
-"""Whether a record begins at rest or in motion: the start by which a linear model predicts better.
+"""Choice of a record's start, rest or motion: the one by which a linear model predicts better.
 
 A file does not say it, and an identification decides it once, of the records that train.
 Two models are estimated from the first three quarters of the record, one from rest and one with an

@@ -27,7 +27,7 @@ def regress(
 ) -> Regression:
     """Least-squares solution of Y = X Θ at every line, by QR; nu <= p <= R.
 
-    With X = Q R only the last block of R acts on the last nu unknowns.
+    In X = Q R only the last block of R acts on the last nu unknowns.
     """
     Q, R = np.linalg.qr(X)
     across = np.abs(np.diagonal(R, axis1=1, axis2=2))

@@ -76,9 +76,9 @@ def spectral_data_of_records(
     """Spectra of periodic records, or ``None`` if their simulation error is no sum over lines.
 
     Noise of the inputs would make every response too small, and what a controller feeds back would
-    bias it, too. What the periods of a record differ by tells its share in U Uᴴ and Y Uᴴ, on which
-    alone the fit depends: it is subtracted (Pintelon and Schoukens, 2012, chapter 9). Of records
-    with references only what follows these is kept.
+    bias it, too. The scatter over the periods tells its share in U Uᴴ and Y Uᴴ, on which
+    alone the fit depends: it is subtracted (Pintelon and Schoukens, 2012, chapter 9). Records
+    with references keep the part that follows these alone.
     """
     records, ny = [each.record for each in normalised], normalised[0].y.shape[1]
     if any(r.start != "periodic" or r.skip for r in records):

@@ -2,8 +2,8 @@
 
 A least-squares fit of a state-space model has many minima, and needs a model to start from. A
 subspace method gives one without iterations. It stacks outputs, at several times or multiplied by
-several powers of z, into a large matrix and removes what follows directly from the inputs. What is
-left is spanned by the extended observability matrix [C; C A; C A²; ...]: a singular value
+several powers of z, into a large matrix and removes what follows directly from the inputs. The
+rest is spanned by the extended observability matrix [C; C A; C A²; ...]: a singular value
 decomposition finds it, its first rows are C, and A moves each block of rows to the next one. The
 singular values that stand out of the noise are as many as the data carry states.
 
