@@ -9,10 +9,10 @@ from an estimated state, as on new data. Both errors count alike:
    of them lowers the error. Each is fitted from two starts along falling ridges, each ridge from
    where the last one ended, all towards the same start, and simulates by the mean of its starts.
    A start that does not forget where it began (``lfrtorch.fitting.forgetting``) takes no part.
-3. Of a size the largest ridge is taken that does as well as its best one, and of the sizes the
+3. A size takes the largest ridge that does as well as its best one, and the choice takes the
    fewest parameters that do about as well as the best (``lfrtorch.data.paired_blocks``).
 
-What a choice of many is worth is not its own error, which is the least of many. So the choice is
+The error of a choice, the least of many, is too small to judge it. So the choice is
 made again without each of the stretches, and judged there (nested cross-validation): the errors of
 ``Choice.left_out``, of both models, had no part in the choice.
 
@@ -89,9 +89,12 @@ _DENSEST = 0.5  # net parameters for each scored output, at most
 
 _WORSE = 1.3  # error over the best of the larger ridges; twice in a row, smaller ones are not tried
 
-_ERRORS, _MOST = 2.0, 1.3
-"""Standard errors, and ratio of rms errors, within which a size is as good as the best: the least
-of many errors is small by chance, too."""
+_ERRORS = 2.0
+"""Standard errors within which a size is as good as the best: the least of many errors is small by
+chance, too."""
+
+_MOST = 1.3
+"""Largest ratio of rms errors within which a size is as good as the best."""
 
 _GAIN = 0.98  # error over the linear model's, or the last best one's, that larger sizes need
 
@@ -106,8 +109,8 @@ class Candidate:
         parameters_net: without the gauge directions.
         ratio: rms error in what was left out over that of the linear model.
         squares: sums of the squared relative errors in the blocks of each stretch, (folds, B).
-        outputs: what simulates each stretch (samples, ny), physical units.
-        remembers: whether no fit without some stretch forgets where it began; it is refused then.
+        outputs: simulations of each stretch (samples, ny), physical units.
+        remembers: no fit without some stretch forgets where it began; it is refused then.
     """
 
     sizes: Sizes
@@ -222,7 +225,7 @@ def choose_sizes(
 
     Args:
         records: all that a model may be estimated from.
-        orders: of the linear models, 1, 2, ...; those of the NL-LFR may be higher, unless ``given``
+        orders: orders of the linear models, 1, 2, ...; the NL-LFR may have more, unless ``given``
             has nx.
         linear: the best linear approximation of an order, which is refined without each stretch.
         start: makes a model, for example ``lambda bla, train, sizes, seed: initialise(bla, train,

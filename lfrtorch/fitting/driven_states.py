@@ -1,6 +1,6 @@
 """States that w alone drives, beside those of the linear model.
 
-A linear model has the states that the input reaches. What a nonlinearity adds begins at rest here:
+A linear model has the states that the input reaches. States of a nonlinearity begin at rest here:
 modes above the band of the inputs, which friction and impacts excite, and relaxations, from which
 hysteresis is made.
 """

@@ -22,7 +22,7 @@ class Exclusion(NamedTuple):
     Args:
         first, second: their names.
         reason: why a fit cannot have both.
-        values: of the first, or their types, if the others of its values go with the second.
+        values: excluded values of the first, or their types, if others go with the second.
     """
 
     first: str

@@ -21,7 +21,7 @@ class FirstPart(Stage):
     name = "the first iterations, on a part of the records"
 
     def when(self, job: Job) -> bool:
-        """Whether there is a part to be fitted."""
+        """Tell if there is a part to be fitted."""
         if job.settings.first_part == 1.0:
             return False
         part, train = self.data(job).train, job.dataset.train
@@ -64,7 +64,7 @@ def _samples(records: Sequence[Record]) -> int:
 
 
 def cost_in_full(settings: Settings) -> int:
-    """How many iterations on all records cost as much as the first ones."""
+    """Number of iterations on all records at the cost of the first ones."""
     part = settings.first_part
     return round(part * settings.first_iterations) if part < 1.0 else 0
 
@@ -87,6 +87,6 @@ def part_of(records: Sequence[Record], part: float) -> list[Record]:
 
 
 def _beginning(record: Record, part: float) -> Record:
-    """What is skipped, and a part of the other samples."""
+    """Skipped samples, and a part of the others."""
     end = record.skip + math.ceil(part * (record.samples - record.skip))
     return record.part(slice(end), start=record.start, skip=record.skip, period=None)

@@ -20,7 +20,7 @@ class Progress:
             have several); validation is NaN if there is no validation record or the model diverges
             on it.
         seconds: since the start of the fit.
-        best: whether this iterate is the best so far, on validation if there is one.
+        best: True if this iterate is the best so far, on validation if there is one.
         report: scalars of the trainer.
         score: normalised squared error that chooses: on validation, or on training without it.
     """
@@ -49,7 +49,7 @@ class FitState:
         judged: trajectories of the latest iterate on validation records.
         best: θ of the best iterate.
         chosen: its place in the history.
-        history: of all iterates, the start first.
+        history: values of all iterates, the start first.
         score: normalised squared error of the iterate that the search goes on from.
         durations: seconds of each accepted iteration.
     """

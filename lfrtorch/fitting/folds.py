@@ -24,7 +24,7 @@ from lfrtorch.data.score_window import SHORTEST, score_window, with_window
 
 
 class Fold(NamedTuple):
-    """What trains, and which samples were left out of it.
+    """Training records, and the samples that were left out of them.
 
     Args:
         train: the records, their measurements masked where they are left out.

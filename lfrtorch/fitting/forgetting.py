@@ -53,7 +53,7 @@ class Memory(NamedTuple):
         apart: largest rms distance of outputs from several starts, over the outputs' deviation;
             infinite if the model diverges from one of them.
         linear: the same of the linear model; 0 if there is none.
-        visited: whether trajectories that stay apart end at states that the records have visited:
+        visited: True if trajectories that stay apart end at states that the records have visited:
             the system has several rests.
 
     Example:
@@ -99,7 +99,7 @@ def forgets(
     """Measure how far a model forgets where it began, on the inputs of its training records.
 
     Args:
-        model: what is simulated.
+        model: model to simulate.
         records: those that it was fitted to.
         linear: the linear model of the same records, or the start of the fit: a model may be as
             slow. Default: none.

@@ -1,6 +1,6 @@
 """Fits that begin at measured outputs: from short windows to long ones.
 
-Of an unstable system no simulation over a long horizon is near the data while the parameters are
+No simulation of an unstable system over a long horizon is near the data while the parameters are
 poor: errors grow with the horizon until they say nothing. The error over a few samples is nearly
 linear in the parameters, so a fit begins there, and goes on with longer windows from where the
 shorter ones led.
@@ -27,10 +27,10 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model.model import Model
 
 PARTS = (0.1, 0.3)
-"""Of the horizon, that windows have first."""
+"""Window lengths of the first two fits, relative to the horizon."""
 
 _ITERATIONS = 10
-"""With each of them."""
+"""Most iterations with each of these windows."""
 
 
 def with_measured_states(model: Model) -> Model:
@@ -54,7 +54,7 @@ class MeasuredStates(Stage):
     """Starts whose states are the normalised outputs."""
 
     def when(self, job: Job) -> bool:
-        """Whether the models are made from a linear model of all outputs."""
+        """Tell if the models are made from a linear model of all outputs."""
         made = job.settings.known is None and job.settings.init_from is None
         return made and begins_at_outputs(job.dataset.train)
 
@@ -67,7 +67,7 @@ class ShortWindows(Stage):
     """A fit over windows of a part of the horizon.
 
     Args:
-        part: of the horizon.
+        part: part of the horizon.
     """
 
     def __init__(self, part: float) -> None:
@@ -75,7 +75,7 @@ class ShortWindows(Stage):
         self.name = f"the fit over windows of {part:g} of the horizon"
 
     def when(self, job: Job) -> bool:
-        """Whether the records begin at outputs, and the horizon is longer than these windows."""
+        """Tell if the records begin at outputs, and the horizon is longer than these windows."""
         horizon = job.settings.horizon
         if job.settings.init_from is not None or horizon is None:
             return False

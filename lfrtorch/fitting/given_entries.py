@@ -2,7 +2,7 @@
 
 Matrices of a linear model are known up to the coordinates of its states. So an entry that is given
 is first an equation for the coordinates: of all, those are taken whose matrices are nearest to what
-is given. What is left between the two is then set, and a fit leaves it alone.
+is given. The given values are then written, and a fit holds them.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class GivenEntries(Stage):
         checked(settings.fixed, shapes(*sizes))
 
     def when(self, job: Job) -> bool:
-        """Whether there are such entries."""
+        """Tell if there are such entries."""
         return bool(job.settings.fixed)
 
     def run(self, job: Job) -> Job:

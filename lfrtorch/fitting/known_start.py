@@ -40,13 +40,16 @@ from lfrtorch.model.known import Known
 from lfrtorch.model.model import Model
 
 _ITERATIONS = 240
-"""Of the first fit, to the parameters alone; there are few of them."""
+"""Iterations of the first fit, of the few parameters alone."""
 
 _FROM_OUTPUTS = 20
 """The same after those over short windows, which begin at outputs."""
 
-_STARTS, _SPREAD = 8, 0.5
-"""Values of the parameters that it starts from, and the deviation of the logarithms of others."""
+_STARTS = 8
+"""Number of values of the parameters from which that fit starts."""
+
+_SPREAD = 0.5
+"""Standard deviation of the logarithms of all values but the first."""
 
 _REACH = 0.3
 """Largest weight of w on a state or an output, of unit rms, at the start."""
@@ -193,7 +196,7 @@ class FromEquations(Stage):
     """A known model with the parameters that are given, and with others near them."""
 
     def when(self, job: Job) -> bool:
-        """Whether one is given."""
+        """Tell if a known model is given."""
         return job.settings.known is not None
 
     def run(self, job: Job) -> Job:
@@ -220,7 +223,7 @@ class Parameters(Stage):
     name = "the fit to the parameters of the known model"
 
     def when(self, job: Job) -> bool:
-        """Whether it has any."""
+        """Tell if it has parameters."""
         return job.settings.known is not None and bool(job.settings.known.parameters)
 
     def trainer(self, job: Job) -> Trainer:
@@ -260,10 +263,10 @@ def fitted_equations(job: Job, linear: LinearModel, train: Sequence[Record]) -> 
 
 
 class Learned(Stage):
-    """What is learned beside a known model, one draw for each start."""
+    """Learned parts beside a known model, one draw for each start."""
 
     def when(self, job: Job) -> bool:
-        """Whether there is a known model."""
+        """Tell if there is a known model."""
         return job.settings.known is not None
 
     def run(self, job: Job) -> Job:

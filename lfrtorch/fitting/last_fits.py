@@ -1,4 +1,4 @@
-"""What may follow a fit: a mean without poor starts, and a fit to all estimation records."""
+"""Stages after a fit: a mean without poor starts, and a fit to all estimation records."""
 
 from __future__ import annotations
 
@@ -24,16 +24,19 @@ from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
 
-_AVERAGED, _POOR = 3, 2.0
-"""Starts of a mean that no held-out record judges, and their training errors over the least, at
-most: the start with the least may be the one that is overfitted (``benchmarks/first_try.md``)."""
+_AVERAGED = 3
+"""Most starts of a mean that no held-out record judges: the start with the least training error
+may be the one that is overfitted (``benchmarks/first_try.md``)."""
+
+_POOR = 2.0
+"""Largest ratio of the training error of such a start to the least one."""
 
 
 class MeanOfGood(Stage):
     """The mean of the few starts with the least training errors, of a model of chosen sizes."""
 
     def when(self, job: Job) -> bool:
-        """Whether no held-out record has judged a mean."""
+        """Tell if no held-out record has judged a mean."""
         return job.choice is not None and bool(job.result.members)
 
     def run(self, job: Job) -> Job:
@@ -45,7 +48,7 @@ class Refit(Stage):
     """A last fit to all estimation records."""
 
     def when(self, job: Job) -> bool:
-        """Whether it is asked for, and records were held out."""
+        """Tell if a refit is asked for, and records were held out."""
         if not job.settings.refit or job.result.reason in CUT_SHORT:
             return False
         if not (job.given.validation or job.given.selection):

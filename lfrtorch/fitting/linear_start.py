@@ -28,7 +28,7 @@ class BestLinear(Stage):
     """The best linear approximation of the records, and its order."""
 
     def when(self, job: Job) -> bool:
-        """Whether states are not the outputs."""
+        """Tell if the states are not the outputs."""
         return not begins_at_outputs(job.dataset.train)
 
     def run(self, job: Job) -> Job:
@@ -47,7 +47,7 @@ class OutputsAsStates(Stage):
     """The linear model whose states are the outputs, of records that begin at these."""
 
     def when(self, job: Job) -> bool:
-        """Whether they do."""
+        """Tell if the states are the outputs."""
         return begins_at_outputs(job.dataset.train)
 
     def run(self, job: Job) -> Job:

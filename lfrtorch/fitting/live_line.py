@@ -150,10 +150,10 @@ class StartsLine:
     """A line that follows all iterations of several starts, and a line for each of their rounds.
 
     Args:
-        starts: how many there are.
-        unit: of the errors.
+        starts: number of starts.
+        unit: unit of the errors.
         stream: where to write. Default: standard output.
-        iterations: of all starts together, for the time left.
+        iterations: those of all starts together, for the time left.
 
     Example:
         >>> from lfrtorch.fitting.live_line import StartsLine

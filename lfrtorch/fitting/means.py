@@ -28,7 +28,7 @@ def mean_model(models: Sequence[Model]) -> Model:
     all, and their static maps beside each other: networks of the same activation are one network.
 
     Args:
-        models: of the same data; they are copied.
+        models: models of the same data; they are copied.
 
     Raises:
         ValueError: no model, models of other channels, scales or rates, or a known model.
@@ -112,7 +112,7 @@ def _held_beside(cells: Sequence[LFRCell], whole: Mapping[str, Tensor]) -> dict[
 
 
 def _alike(one: Model, other: Model) -> bool:
-    """Whether two models have the same channels, scales and rate."""
+    """Tell if two models have the same channels, scales and rate."""
     scales = zip(vars(one.scaler).values(), vars(other.scaler).values(), strict=True)
     return (one.inputs, one.outputs, one.fs) == (other.inputs, other.outputs, other.fs) and all(
         np.array_equal(*pair) for pair in scales

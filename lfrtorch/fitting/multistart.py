@@ -1,7 +1,7 @@
 """A fit from several starts: the better half goes on after each of the first rounds.
 
 The rounds end at 1/16 and 1/8 of the iterations; the quarter that is left, two at least, goes to
-the end. Of 16 starts 4 do, and all cost as much as 5 fits. This is successive halving with early
+the end. Four of 16 starts do, and all cost as much as 5 fits. This is successive halving with early
 decisions: on the Bouc-Wen benchmark (16 starts, 5 realisations, 200 iterations) they
 lose little, as starts that come to nothing show at once, and later ones lose the best. Mean of the
 smallest squared validation error: all to the end 3.37 (3026 iterations), half after 1/16 or 1/8
@@ -348,7 +348,7 @@ def _check(starts: Sequence[Model], watching: Sequence[Sequence[Monitor]], avera
 
 
 def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]:
-    """How many starts take part in each round, and the iteration at which it ends."""
+    """Number of starts in each round, and the iteration at which it ends."""
     parts = ROUNDS if starts > 1 else ()
     planned = []
     for until in sorted({ceil(part * limit) for part in parts} | {limit}):
@@ -360,7 +360,7 @@ def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]
 
 
 def cheap_starts(rows: int, parameters: int, limit: int) -> int:
-    """How many starts take about a minute on one core, 8 at most."""
+    """Number of starts that take about a minute on one core, 8 at most."""
     # An iteration takes 20 ns for each row and parameter (Bouc-Wen: 8192 samples, 89 parameters,
     # 14 ms). Measured seconds would make the number depend on the machine.
     work = 20e-9 * rows * parameters

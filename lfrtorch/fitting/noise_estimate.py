@@ -20,10 +20,10 @@ from lfrtorch.model.model import Model
 def estimate_noise(model: Model, records: Record | Sequence[Record]) -> NoiseCovariance:
     """The noise that an extended Kalman filter of a model needs, from records.
 
-    Of a model in innovation form Λ is the mean square of the innovations, and then Q = K Λ Kᵀ,
-    S = K Λ and R = Λ. Of another model Q and R are diagonal, and those of the greatest likelihood
+    A model in innovation form has the mean square Λ of the innovations, and then Q = K Λ Kᵀ,
+    S = K Λ and R = Λ. Any other model has diagonal Q and R, those of the greatest likelihood
     of the records: of the filter's errors one sample ahead, each with the variance that it says.
-    What the model lacks counts as noise, too. Skipped samples are not scored in the
+    Errors of the model count as noise, too. Skipped samples are not scored in the
     innovation form; a filter begins at the first sample.
 
     It takes some hundred passes over the records; a few thousand samples are enough.

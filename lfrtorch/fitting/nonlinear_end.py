@@ -1,4 +1,4 @@
-"""Whether the nonlinearity of a system is at its input (Hammerstein) or at its output (Wiener)."""
+"""Test for a nonlinearity at the input (Hammerstein) or at the output (Wiener) of a system."""
 
 from __future__ import annotations
 

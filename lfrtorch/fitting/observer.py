@@ -1,4 +1,4 @@
-"""Who looks on while a model is identified."""
+"""Callbacks of an identification: progress, notes, monitors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lfrtorch.model.model import Model
 
 
 class Watching(NamedTuple):
-    """What a fit calls, see :func:`lfrtorch.fit`.
+    """Callback of a fit, see :func:`lfrtorch.fit`.
 
     Args:
         monitors: a list for each start, called after each of its iterations.
@@ -38,7 +38,7 @@ class Observer:
         """Take a sentence or a table, when it is known."""
 
     def searching(self) -> Monitor | None:
-        """What sees every iteration of the search for sizes; None: a line on a terminal."""
+        """Monitors of every iteration of the search for sizes; None: a line on a terminal."""
         return lambda model, progress: None
 
     def begin(

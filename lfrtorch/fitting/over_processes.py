@@ -22,9 +22,12 @@ from lfrtorch.distributed import ProcessLostError, Ranks, current
 from lfrtorch.fitting.side_by_side import Together
 from lfrtorch.fitting.trainer import Fit, Monitor, Stop
 
-SHORT, LONG = 10.0, 60.0
-"""Seconds of a leg: shorter ones get twice the iterations, longer ones half of them, as a process
-that waits longer than its timeout takes the others for lost."""
+SHORT = 10.0
+"""Seconds of a leg below which the next one gets twice the iterations."""
+
+LONG = 60.0
+"""Seconds of a leg above which the next one gets half of the iterations, as a process that waits
+longer than its timeout treats the others as lost."""
 
 Take = Callable[[int, bytes], None]
 """Called with the number of a start and the state of its fit, as ``Fit.save`` writes it."""

@@ -15,7 +15,7 @@ Size = int | Literal["auto"]
 """A number, or one that the data choose."""
 
 Noise = Literal["output", "innovation"]
-"""What is fitted: simulations, as if noise were at the outputs alone, predictions, or both."""
+"""Criteria of a fit: simulation errors, as if noise were at the outputs alone, or predictions."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,15 +44,15 @@ def refit(
 ) -> FitResult:
     """Go on with a fit on its training records and those that were held out to choose.
 
-    Of a mean of several models each is fitted, and the mean taken again. The errors on the records
+    Each model of a mean is fitted, and the mean taken again. The errors on the records
     that were held out are no validation any more: quote those of ``result``.
 
     Args:
-        result: of :func:`lfrtorch.fit`; its model is copied.
+        result: result of :func:`lfrtorch.fit`; its model is copied.
         train: records that it was fitted to.
         held_out: records that chose its iterate. One that begins in a training record, as the
             parts of a measurement do, continues that record.
-        trainer, ridge, noise, horizon: of the fit; ridge pulls towards the model that was chosen.
+        trainer, ridge, noise, horizon: as in the fit; ridge pulls towards the chosen model.
         iterations: that were chosen. Default: those of the fit, without what came before it.
         monitor: called after every iteration. Default: a line on a terminal or in a notebook.
         stop: see :func:`lfrtorch.fit`.
@@ -97,7 +97,7 @@ def refit(
 
 
 def estimation_records(dataset: Dataset) -> list[Record]:
-    """What a second fit is to: all records but the tests."""
+    """Records of a second fit: all but the tests."""
     return all_records(dataset.train, [*dataset.validation, *dataset.selection])
 
 
@@ -114,7 +114,7 @@ def all_records(train: Sequence[Record], held_out: Sequence[Record]) -> list[Rec
 
 
 def _continues(record: Record, other: Record) -> bool:
-    """Whether the samples that a record skips are the last ones of another."""
+    """Tell if the samples that a record skips are the last ones of another."""
     count = min(record.skip, other.samples)
     if not count or "periodic" in (record.start, other.start):
         return False

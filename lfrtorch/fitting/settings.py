@@ -40,7 +40,7 @@ SEED_STEP = 1000
 @documented
 @dataclass(frozen=True, kw_only=True)
 class Settings(PlainSettings):
-    """How a model is identified; see :func:`lfrtorch.identify`.
+    """Settings of an identification; see :func:`lfrtorch.identify`.
 
     Raises:
         ValueError: a setting that cannot be, or two that exclude each other.
@@ -215,7 +215,7 @@ class Settings(PlainSettings):
 
     @property
     def averages(self) -> bool:
-        """Whether a mean of models keeps what their systems hold: not if it is of predictors."""
+        """True if a mean of models keeps held entries of their systems: not that of predictors."""
         integrates = bool(np.any(self.linear.get("integrators", 0)))
         holds = self.structure not in ("free", "hammerstein") or not {*TIED}.isdisjoint(self.fixed)
         return self.noise == "output" or not (holds or integrates)

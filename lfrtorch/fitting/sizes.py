@@ -28,14 +28,14 @@ _CHOOSING = 20_000
 """Training samples that sizes are chosen with, at most."""
 
 _ITERATIONS = 75
-"""Of a fit that no validation record ends: about as many as its ridge was chosen with."""
+"""Iterations of a fit without validation: about as many as its ridge was chosen with."""
 
 
 class Sizes(Stage):
     """Sizes and ridge that are ``"auto"``, by cross-validation."""
 
     def when(self, job: Job) -> bool:
-        """Whether any is."""
+        """Tell if any of them is ``"auto"``."""
         return bool(job.settings.searched)
 
     def run(self, job: Job) -> Job:

@@ -22,7 +22,7 @@ class Snapshots:
     Args:
         folder: where they are; without one nothing is kept.
         every: least seconds between two files of one start; there is one at each of its ends.
-        writes: whether files are written; of several processes the first one's are.
+        writes: write files; the first of several processes does.
 
     Raises:
         ValueError: damaged files.

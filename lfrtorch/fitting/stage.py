@@ -40,7 +40,7 @@ from lfrtorch.linear.order_scan import OrderScan
 from lfrtorch.model.model import Model
 
 _LATER: Any = None
-"""Of a field that a later stage fills."""
+"""Value of a field that a later stage fills."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +53,9 @@ class Job:
         settings, observer, stop, snapshots: see :func:`lfrtorch.identify`.
         linear: the best linear approximation.
         begun: that of the order that models start with.
-        order_scan, choice: of its order, and of the sizes.
+        order_scan, choice: choice of its order, and of the sizes.
         models: where the next fit starts.
-        ridge: of the next fit, if it is another than in the settings.
+        ridge: ridge of the next fit, if it differs from the settings.
         result, again: the fit, and that to all estimation records.
     """
 
@@ -98,13 +98,13 @@ class Stage:
     """One of them; a fit, unless it overrides ``run``."""
 
     name = ""
-    """What it is, after "stopped during"."""
+    """Name of the stage, after "stopped during"."""
 
     def check(self, job: Job) -> None:
         """Refuse what cannot be, before anything is computed."""
 
     def when(self, job: Job) -> bool:
-        """Whether it takes part."""
+        """Tell if the stage takes part."""
         return True
 
     def models(self, job: Job) -> Sequence[Model]:
@@ -112,7 +112,7 @@ class Stage:
         return job.models
 
     def data(self, job: Job) -> Data:
-        """What it fits."""
+        """Data of the fit."""
         return Data.of(job.dataset)
 
     def trainer(self, job: Job) -> Trainer:
@@ -124,7 +124,7 @@ class Stage:
         return {}
 
     def keep(self, job: Job, result: FitResult) -> Job:
-        """What comes of it."""
+        """Keep the result of the fit."""
         raise NotImplementedError
 
     def run(self, job: Job) -> Job:

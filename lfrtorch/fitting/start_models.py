@@ -33,7 +33,7 @@ class FromModel(Stage):
             check_channels(job.settings.init_from, job.given.train[0])
 
     def when(self, job: Job) -> bool:
-        """Whether there is one."""
+        """Tell if a start model is given."""
         return job.settings.init_from is not None
 
     def run(self, job: Job) -> Job:
@@ -51,7 +51,7 @@ class FromLinear(Stage):
     """The linear model with random static maps, one for each start."""
 
     def when(self, job: Job) -> bool:
-        """Whether nothing else is given to start from."""
+        """Tell if no other start is given."""
         return job.settings.init_from is None and job.settings.known is None
 
     def run(self, job: Job) -> Job:

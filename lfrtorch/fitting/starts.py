@@ -100,15 +100,15 @@ def initialise(
         nn, activation: neurons of the network and their function.
         static: the map z -> w in the network's place, copied: a ``Network``, a ``Polynomial`` or
             any module from (..., nz) to (..., nw); nn and activation are then of no use.
-        method: which of the two starts.
-        seed: of the random weights.
-        relaxations, modes: how many are added to those of the linear model, one and two states
+        method: one of the two starts.
+        seed: seed of the random weights.
+        relaxations, modes: numbers that are added to those of the linear model, one and two states
             each.
-        z_feedthrough: whether the input acts on z at once.
-        feedthrough: whether it acts on the output at once; if not, the linear model has D = 0.
+        z_feedthrough: the input acts on z at once.
+        feedthrough: it acts on the output at once; if not, the linear model has D = 0.
         structure: ``"free"``, ``"wiener"``, ``"hammerstein"``, ``"wiener_hammerstein"`` or
             ``"parallel"``.
-        dtype: of the weights.
+        dtype: dtype of the weights.
 
     Raises:
         ValueError: sizes below 1, or so large that a fit takes more memory than there is, a dtype

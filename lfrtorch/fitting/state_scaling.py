@@ -43,7 +43,7 @@ def scale_states(
 
 
 def _scalable(cell: LFRCell) -> bool:
-    """Whether other units of the states change no entry that a fit holds.
+    """Tell if other units of the states change no entry that a fit holds.
 
     Zeros and the diagonal of A stay. Entries between integrators change, and these stay exact.
     """

@@ -52,7 +52,7 @@ class Trainer(Protocol):
 
     @property
     def guarantee(self) -> Name | None:
-        """What every model on the way keeps: a stable A, or contraction."""
+        """Property enforced at every iteration: a stable A, or contraction."""
         ...
 
     def init(self, problem: Any, theta: Tensor, point: Point | None = None) -> Any:
@@ -84,7 +84,7 @@ Keep = Callable[["Fit", bool], None]
 
 @dataclass(frozen=True)
 class RestartSummary:
-    """How far one of several starts came.
+    """Progress of one of several starts.
 
     Args:
         number: its place in the order given, from 0.
@@ -130,7 +130,7 @@ class FitResult:
             taken before are added.
         seconds_per_iteration: median over the accepted iterations but the first, which may compile.
         reason: why the search ended, a :class:`lfrtorch.Reason`.
-        detail: what else is known of a process that was lost, or a slope that is not finite.
+        detail: further remark on a lost process, or on a slope that is not finite.
         starts: all starts if there were several, the best first.
         averaged: number of starts that the model is the mean of; history and iterate are those
             of the best one.
@@ -232,7 +232,7 @@ class Fit:
 
     @property
     def diverges(self) -> bool:
-        """Whether the model diverges on the training records at the start."""
+        """True if the model diverges on the training records at the start."""
         return self.reason == Reason.START_DIVERGES
 
     @property
@@ -243,7 +243,7 @@ class Fit:
 
     @property
     def over(self) -> bool:
-        """Whether there is no more to come."""
+        """True if the fit has ended."""
         if self.at is None or self.diverges:
             return self.diverges
         return bool(self.state.reason) or self.state.iteration >= self.trainer.limit
@@ -257,7 +257,7 @@ class Fit:
         self.reason, self.detail = reason, detail
 
     def stopped(self) -> bool:
-        """Whether the fit is asked to end here, which then is its reason."""
+        """Tell if the fit is asked to end here, which then is its reason."""
         asked = self._stop is not None and bool(self.problem.total(torch.tensor(int(self._stop()))))
         if asked:
             self.note_end(Reason.INTERRUPTED)
@@ -356,7 +356,7 @@ class Fit:
         self._write_best()
 
     def result(self) -> FitResult:
-        """What was found."""
+        """Result of the fit."""
         assert self.at is not None
         usual = self.at.durations[1:] or self.at.durations
         return FitResult(

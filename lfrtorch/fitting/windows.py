@@ -6,8 +6,8 @@ Far from the minimum it has many poor ones, and where small changes of θ grow a
 h samples changes grow for h samples at most, and the error is still one of a simulation.
 
 Each window begins in a state of its own that is fitted with the parameters, as that of a record
-with an estimated start is: multiple shooting without constraints. Of white noise on the outputs
-nx ny errors of each window go into its state, whatever the parameters are, so that windows of a
+with an estimated start is: multiple shooting without constraints. White noise on the outputs
+puts nx ny errors of each window into its state, for all parameters, so that windows of a
 linear model have the minimum of whole records but for chance. The alternative, a state from the
 one-step predictor of an innovation form (the error of predictions 1 to h samples ahead), needs the
 gain K, which the data do not tell while the model is poor, and does not exist for models with exact
@@ -48,7 +48,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.data.records import Record
 
 BEFORE = 20
-"""Outputs for each state before a window of validation. Of good models of the wells in
+"""Outputs for each state before a window of validation. For good models of the wells in
 ``benchmarks/horizon.py``, with two states, 40 samples told the start of 81 of 81 windows, 50 of 78,
 and 100 of 61 of 84: where small changes grow, the error over more samples has many minima."""
 
