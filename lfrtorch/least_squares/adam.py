@@ -62,7 +62,7 @@ class AdamState:
 
     @property
     def report(self) -> dict[str, float]:
-        """What the monitors show of a step."""
+        """Values of a step for monitors."""
         return {"gradient_norm": float(self.gradient.norm())}
 
 

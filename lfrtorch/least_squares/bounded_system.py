@@ -22,10 +22,10 @@ class Bounds(Protocol):
     """C, for the first entries of a step; the others are 0."""
 
     room: Float[Tensor, " bounds"]
-    """How far a step may go."""
+    """Limits of a step."""
 
     trusted: bool
-    """Whether a free step within the bounds is taken as it is."""
+    """Tell if a free step within the bounds is taken unchanged."""
 
     corrections: int
     """Most rounds in which they are tightened."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 from lfrtorch._support.memory import check_memory
 from lfrtorch.engine.cell import LFRCell
 
-SQUARES, TALL = 4, 3
-"""Matrices of P x P that a step holds at once (JᵀJ, the columns that it is of, damped, its factor),
-and of P x gauge directions."""
+SQUARES = 4
+"""Matrices of P x P that a step holds at once: JᵀJ, its columns, damped, its factor."""
+
+TALL = 3
+"""Matrices of P x gauge directions that a step holds at once."""
 
 
 def check_fit_memory(cell: LFRCell, states: int = 0, rows: int = 0) -> None:

@@ -1,10 +1,10 @@
 """Columns of the Jacobian that gauge directions leave: the others follow from them.
 
 Directions G in θ that change no output (``engine.gauge_directions``) have J G = 0: some columns of
-J are combinations of others. Those columns need not be computed. With the columns ``kept``,
+J are combinations of others. Those columns need not be computed. The columns ``kept`` give
 J = J[:, kept] @ expand, exactly.
 
-Which columns are left out is a choice. J[:, left_out] = -J[:, kept] G[kept] G[left_out]⁻¹, so the
+The columns left out are a choice. J[:, left_out] = -J[:, kept] G[kept] G[left_out]⁻¹, so the
 rows G[left_out] must be well conditioned: a QR decomposition with pivoting picks them.
 """
 
@@ -68,7 +68,7 @@ def reduction(
     before: Reduction | None = None,
     fixed: Bool[Tensor, " free"] | None = None,
 ) -> Reduction:
-    """Which columns of the Jacobian of the free parameters to compute."""
+    """Columns of the Jacobian of the free parameters to compute."""
     # Those of ``initial_states`` come last and are kept. ``coordinates``: no initial state is given
     # in those of x. ``before``: the reduction at weights close by, whose columns are kept if they
     # still do. ``fixed`` entries of the free parameters have columns of zeros.

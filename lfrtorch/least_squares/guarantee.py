@@ -1,4 +1,4 @@
-"""What a search guarantees of every model on its way: a stable linear part, or contraction."""
+"""Guarantees of every model of a search: a stable linear part, or contraction."""
 
 from __future__ import annotations
 

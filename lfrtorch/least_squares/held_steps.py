@@ -32,12 +32,12 @@ class Projection:
 
     @property
     def held(self) -> bool:
-        """Whether anything is."""
+        """True if anything is held."""
         return self._any or self.tied
 
     @property
     def tied(self) -> bool:
-        """Whether equations are, between entries."""
+        """True if equations between entries are held."""
         return self._normals is not None
 
     def __call__(self, columns: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
@@ -68,10 +68,10 @@ class ProjectedSystem:
 
 
 class HeldSteps:
-    """What a search over θ holds: entries, and a predictor's equations.
+    """Constraints of a search over θ: held entries, and a predictor's equations.
 
     Args:
-        cell: of the start.
+        cell: cell of the start.
         parameters: θ.
         size: P.
     """

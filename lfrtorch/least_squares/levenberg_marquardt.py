@@ -36,7 +36,7 @@ FASTEST_DECREASE = 0.2
 FIRST = 0.1
 """Factor on λ from trial to trial of the first step, as long as the decrease grows by this part.
 
-The gain ratio stays near 1 down to some λ, and is far below 0 at the next two. What that saves is
+The gain ratio stays near 1 down to some λ, and is far below 0 at the next two. The saving is
 in benchmarks/starts.md.
 """
 
@@ -70,7 +70,7 @@ class Point(NamedTuple):
         theta: θ (P,).
         residual: r (M,).
         cost: |r|².
-        seen: what else the problem needs for derivatives there, as trajectories: tuples of tensors.
+        seen: further values for derivatives there, as trajectories: tuples of tensors.
     """
 
     theta: Tensor
@@ -136,7 +136,7 @@ class LMState:
 
     @property
     def report(self) -> dict[str, float]:
-        """What the monitors show of a step."""
+        """Values of a step for monitors."""
         if self.damping is None:
             return {}
         return {

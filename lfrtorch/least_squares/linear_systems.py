@@ -26,12 +26,18 @@ from lfrtorch._support.types import Array
 MERGED = 16
 """Triangles are merged into one when they have this many times the rows of one."""
 
-PIECES, TALL = 16, 8
-"""Rows are cut into at most 16 pieces for the threads, each at least 8 times as tall as wide: the
-merge of their triangles then takes at most an eighth of the work."""
+PIECES = 16
+"""Most pieces of the rows for the threads."""
 
-WIDE, PANELS = 256, 16
-"""JᵀJ of more columns, in rows too few for pieces, is found in panels that the threads share."""
+TALL = 8
+"""Least ratio of height to width of a piece: the merge of the triangles then takes at most an
+eighth of the work."""
+
+WIDE = 256
+"""Columns above which JᵀJ of few rows is found in panels that the threads share."""
+
+PANELS = 16
+"""Number of these panels."""
 
 KRYLOV = 400
 """Parameters from which the largest eigenvalue is found without the others."""

@@ -91,7 +91,7 @@ class Problem(LeastSquares):
     # What follows is shared by several processes (``shared_problem``), or by one alone.
 
     shared = False
-    """Whether other processes have some of the records."""
+    """True if other processes have some of the records."""
 
     def total(self, part: Tensor) -> Tensor:
         """The sum of the parts of all processes."""
@@ -206,7 +206,7 @@ class Problem(LeastSquares):
 
     @cached_property
     def _worth_reducing(self) -> bool:
-        """Whether columns that gauge directions make dependent take longer than to find them."""
+        """Tell if columns that gauge directions make dependent take longer than to find them."""
         # The damping holds those directions as well: it is a matter of time alone.
         W, P = self.lfr.cell.weights(), len(self.theta)
         sizes = [s.place.stop - s.place.start for s in W.map.symmetries]
@@ -281,7 +281,7 @@ class Problem(LeastSquares):
             term.release()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What the next evaluations depend on besides θ, to the last bit."""
+        """State besides θ on which the next evaluations depend, to the last bit."""
         kept = {} if self._reduced is None else {"kept": self._reduced.kept}
         return {"start": self.theta, **kept}
 

@@ -76,7 +76,7 @@ class RecordGroup:
 
     @cached_property
     def plain(self) -> bool:
-        """Whether every sample counts alike."""
+        """True if every sample has the same weight."""
         return not self.spectral and bool((self.weight == 1).all())
 
     def unweigh(self, r: Float[Tensor, "R T ny"]) -> Float[Tensor, "R T ny"]:
@@ -142,7 +142,7 @@ def _limits(each: NormalisedRecord) -> Float[Array, "2 1 ny"]:
 
 
 def _factors(record: Record) -> Float[Array, "m ny"]:
-    """What multiplies the errors, or their spectrum by ``rfft``."""
+    """Factors of the errors, or of their spectrum by ``rfft``."""
     T, ny = record.y.shape
     if record.line_weight is None:
         return record.factors

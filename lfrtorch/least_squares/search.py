@@ -20,7 +20,7 @@ class Search:
     """A problem and the optimiser that searches its minimum.
 
     Args:
-        problem: what is minimised.
+        problem: problem to minimise.
         optimiser: ``LevenbergMarquardt``, ``Adam``, or another with ``init`` and ``step``.
         state: where it stands. Default: ``begin`` says.
     """

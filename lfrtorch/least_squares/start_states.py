@@ -1,11 +1,11 @@
 """Start states that are parameters: each is eliminated from its own record.
 
-Of θ = (φ, x0 of record 1, x0 of record 2, ...) each record sees φ and its own start state. So
+In θ = (φ, x0 of record 1, x0 of record 2, ...) each record sees φ and its own start state. So
 JᵀJ + λI has entries between φ and everything else alone, and with A and B, the columns of φ and of
 x0 in the rows of a record, every x0 follows from φ: a system in φ is left, whose size does not
 grow with the number of records. That of all of θ takes time with the cube of it.
 
-With B = U s Vᵀ the start states leave A - U (Uᵀ A) of the rows for φ at λ = 0. A damping λ keeps
+Let B = U s Vᵀ: the start states leave A - U (Uᵀ A) of the rows for φ at λ = 0. A damping λ keeps
 them from following φ all the way, and λ / (s² + λ) of each row of Uᵀ A remains.
 
 References:
@@ -34,7 +34,7 @@ from lfrtorch.least_squares.linear_systems import (
 
 
 class StartStates(NamedTuple):
-    """What the rows of records say about their start states, in the coordinates Vᵀ x0."""
+    """Information of the rows of records on their start states, in the coordinates Vᵀ x0."""
 
     # B = U s Vᵀ; A and r are Uᵀ A and Uᵀ r; ``place`` is where each start state stands in θ.
 

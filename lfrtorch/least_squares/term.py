@@ -13,7 +13,7 @@ from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator
 from lfrtorch.least_squares.start_states import StartStates
 
 Seen = tuple[Any, ...]
-"""What a term found at a θ and linearises about: tuples of tensors, as trajectories."""
+"""Values of a term at a θ, about which it linearises: tuples of tensors, as trajectories."""
 
 
 class Term(Protocol):
@@ -40,7 +40,7 @@ class TermRows(Protocol):
     """Some rows of J, weighted, and the residual there; gauge directions leave them as they are."""
 
     count: int
-    """How many rows there are."""
+    """Number of rows."""
 
     states: StartStates | None
     """The initial states that the last ``fold`` eliminated."""
