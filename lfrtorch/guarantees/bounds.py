@@ -6,10 +6,10 @@ x is the response of a stable linear system to u and w. About their middles, wit
 
 so that |δu| <= r brings any row c of it no further than Σ_j |c Aʲ Bu| r, the sum of the impulse
 response's moduli; likewise w, as the map is bounded. That bounds z, which bounds w more tightly,
-and so on. With w = K z + δw the loop is closed through K first, as soon as z is bounded: then the
+and so on. The loop is closed through K of w = K z + δw as soon as z is bounded: then the
 rest of the map is small, and so are the bounds.
 
-The sums end after N samples. With M = Aᴺ the rest of them is at most |M| (I - |M|)⁻¹ times the sums
+The sums end after N samples. The rest of them is at most |M| (I - |M|)⁻¹, M = Aᴺ, times the sums
 of the states, entry by entry.
 
 References:
@@ -55,7 +55,7 @@ class Bound:
     """Proven bounds, up to rounding errors; ``print(bound)`` shows those of the outputs.
 
     Args:
-        amplitude: of the inputs, (nu,), physical units: |u - offset| is at most so.
+        amplitude: amplitude of the inputs, (nu,), physical units: the bound of |u - offset|.
         y: lowest and highest value of each output, (ny, 2), physical units.
         x, z, w: the same of states and of the static map's signals, in the model's coordinates,
             as in ``model.signals(record)``.
@@ -90,13 +90,13 @@ class Bound:
 
 @typed()
 def bound(model: Model, amplitude: ArrayLike, *, x0: ArrayLike | None = None) -> Bound:
-    """What the states and outputs of a model stay within, whatever the input of an amplitude.
+    """Bounds of the states and outputs of a model, for all inputs of an amplitude.
 
     It is reached by the worst input of a linear model, and may be far from that of a nonlinear one.
     The mathematics stand at the head of ``lfrtorch/guarantees/bounds.py``.
 
     Args:
-        model: with a stable A, and a network of tanh, sigmoid or rbf; or linear.
+        model: a model with a stable A, and a network of tanh, sigmoid or rbf; or linear.
         amplitude: largest |u - offset|, physical units; the offsets are those of the model.
         x0: initial state in the model's coordinates. Default: 0.
 

@@ -1,4 +1,4 @@
-"""Whether all trajectories of a model come together: one linear matrix inequality.
+"""Certificate that all trajectories of a model converge: one linear matrix inequality.
 
 The difference of two trajectories obeys a linear system with a few uncertain slopes::
 
@@ -15,7 +15,7 @@ The last two terms are not negative, so |x|_P shrinks by ρ in every sample. Lik
     |x+|²_P - |x|²_P + |v|²_T - |p|²_T + |y|² - γ²|u|² < 0
 
 for all x, p and u, the sum of |y|² is at most γ² times that of |u|². Both are linear in P, T and
-γ². An interior-point method finds them. Whether they do what they should is checked afterwards with
+γ². An interior-point method finds them. The inequality is checked afterwards with
 the eigenvalues of the matrices, so the method need not be trusted.
 
 References:
@@ -42,10 +42,10 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.maps.enclosure import Enclosure, Interval
 
 ACCURACY = 1e-9
-"""Of the solver, relative."""
+"""Relative accuracy asked of the SDP solver."""
 
 ROUNDING = 10 * np.finfo(np.float64).eps
-"""Of a sum, relative to the sum of its moduli, times the length: what an eigenvalue must exceed."""
+"""Rounding error of a sum, relative to the sum of moduli times its length."""
 
 SLOWEST = 1.0 - 1e-6
 """A rate that counts as contraction: a million samples to shrink to 1/e."""
@@ -309,7 +309,7 @@ def _unpacked(found: Array, nx: int, q: int) -> tuple[Array, Array]:
 
 
 def holds(system: Differences, found: Certificate, rate: float, gain: float | None = None) -> bool:
-    """Whether P and T do what they should, beyond rounding errors."""
+    """Tell if P and T satisfy the inequality beyond rounding errors."""
     P, T = found
     if P.shape != system.A.shape or len(T) != len(system.C) or not (T >= 0).all():
         return False
@@ -317,7 +317,7 @@ def holds(system: Differences, found: Certificate, rate: float, gain: float | No
 
 
 def _is_negative(terms: Sequence[tuple[Array, Array]]) -> bool:
-    """Whether Σ Sᵀ Q S is negative definite beyond rounding errors."""
+    """Tell if Σ Sᵀ Q S is negative definite beyond rounding errors."""
     M = sum(S.T @ Q @ S for S, Q in terms)
     size = sum(np.abs(S).T @ np.abs(Q) @ np.abs(S) for S, Q in terms)
     assert isinstance(M, np.ndarray)

@@ -1,4 +1,4 @@
-"""Whether a model forgets: a proof that all its trajectories under the same input come together."""
+"""Contraction of a model: a proof that all trajectories under the same input converge."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _HALVINGS, _MORE_CELLS = 6, 20  # of the rate in the region of the data; a solve
 _FIRST_CELLS, _LAST_CELLS = 2**12, 2**16  # of that region: of the first grid, and of all
 
 _SLACK = 0.02
-"""So much of 1 - ρ a proof there may lose to the size of its cells."""
+"""Part of 1 - ρ that a proof there may lose by the size of its cells."""
 
 _LEAST = 1e-3
 """The rate is looked for between this part of the best possible 1 - ρ and all of it."""
@@ -51,16 +51,16 @@ _LEAST = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Contraction:
-    """What was proven; ``print(contraction)`` says it in words.
+    """Result of a proof; ``print(contraction)`` says it in words.
 
     Args:
-        amplitude: of the inputs about their offsets, (nu,), physical units, for which it holds:
+        amplitude: that of the inputs about their offsets, (nu,), physical units, for the proof:
             infinite if for all; 0 if nothing was found.
         rate: ρ, the norm of the difference shrinks to ρ times its size or less in every sample; NaN
             if nothing was found.
         gain: γ, the largest root sum of squares of the outputs' difference over that of the
             inputs', of all channels together, in physical units; NaN if none was found.
-        P: of the norm √(ΔxᵀPΔx), (nx, nx), in the model's coordinates; ``None`` if nothing was
+        P: matrix of the norm √(ΔxᵀPΔx), (nx, nx), in the model's coordinates; ``None`` if none was
             found.
         data_rate: ρ as long as z stays in the region of the data, in a norm of its own; NaN if it
             was not looked for or not found.
@@ -84,7 +84,7 @@ class Contraction:
 
     @property
     def found(self) -> bool:
-        """Whether the model was proven to contract."""
+        """True if the model was proven to contract."""
         return self.P is not None
 
     def __str__(self) -> str:
@@ -149,10 +149,10 @@ def contraction(
     that knows its data (``model.reach``) is told this rate, ``data_rate``, in any case.
 
     Args:
-        model: with a network of any activation, or linear. With an amplitude, A must be stable, and
+        model: a linear model, or one with any network. For an amplitude, A must be stable, and
             the network of tanh, sigmoid or rbf.
         records: whose region is asked for. Default: none.
-        amplitude: of the inputs, largest |u - offset|, physical units. Default: all inputs, or, if
+        amplitude: largest |u - offset| of the inputs, physical units. Default: all inputs, or, if
             nothing is found for them, the largest amplitude for which something is.
 
     Shape:
@@ -290,7 +290,7 @@ class _Box:
     z: Cloud
 
     def slopes(self, cells: Interval) -> Interval | None:
-        """What ∂w/∂v cannot leave in cells of v."""
+        """Bounds of ∂w/∂v over cells of v."""
         into = np.asarray(np.linalg.inv(self.z.axes), dtype=np.float64)
         return self.cell.map.slopes_in(cells, into, self.z.middle)
 
@@ -307,7 +307,7 @@ class _Box:
         return M.A + M.Bw @ J @ self.z.axes @ M.Cz
 
     def rate(self, P: Float[Array, "nx nx"]) -> float:
-        """What the norm of P shrinks to, proven: cells are halved where that is not known well."""
+        """Proven contraction rate in the norm of P: cells are halved where the bound is loose."""
         L = np.linalg.cholesky(P).T
         M = self.cell.matrices()
         left, right = np.abs(L @ M.Bw), np.abs(self.z.axes @ M.Cz @ np.linalg.inv(L))
