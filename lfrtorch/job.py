@@ -44,7 +44,7 @@ def identify(
         dataset: records by use. One record, or several, are cut in time as a file is: the first
             0.6 of each for the fit, 0.2 that choose the iterate, and the last 0.2 as a test.
         settings: sizes, starts and trainer.
-        observer: who is told of every step. Default: a line on a terminal or in a notebook shows
+        observer: object that is told of every step. Default: a live line, which shows
             how far it is. :class:`lfrtorch.reporting.Console` prints every step,
             :class:`Observer` nothing.
         snapshots: where the starts are kept, for a program that goes on with them.

@@ -108,11 +108,11 @@ def _beginning(stream: FileStream, samples: int) -> tuple[Array, Array]:
 
 
 class Simulated(NamedTuple):
-    """What is known of a file that was simulated.
+    """Result of the simulation of a file.
 
     Args:
         samples, skip: written, and how many at the beginning are not scored.
-        scores: of measured outputs after the skipped samples.
+        scores: scores of measured outputs after the skipped samples.
         settled: the same without the first ``BEGINNING`` of those, either.
         peaks: largest inputs about the operating point, in standard deviations of the model's
             training inputs, (nu,).
