@@ -48,7 +48,7 @@ def number(value: float | None, digits: int = _DIGITS) -> str:
         return UNKNOWN
     if value == 0:
         return "0"
-    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")  # of the rounded value
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")  # exponent of the rounded value
     if _SMALLEST <= abs(float(f"{mantissa}e{exponent}")) < _LARGEST:
         return f"{value:.{max(0, digits - 1 - int(exponent))}f}"
     return f"{mantissa}e{int(exponent)}"

@@ -19,7 +19,7 @@ Grid = Literal["full", "odd", "random_odd"]
 
 @dataclass(frozen=True, eq=False)
 class Multisine:
-    """One period of each experiment, and its excited lines; line k is at k fs / N Hz.
+    """Multisines: one period of each experiment, and the excited lines; line k is at k fs / N Hz.
 
     Args:
         u: one period of every experiment; nu experiments after one another are one realisation.

@@ -69,7 +69,7 @@ def of_one_unit(channels: Sequence[Channel]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One measurement: input, output, and how it is to be simulated and scored.
+    """Measurement: input, output, and their use in simulations and scores.
 
     Args:
         u, y: input and output, physical units. A one-dimensional array is one channel.
@@ -656,7 +656,7 @@ class Scaler:
 
     def restore_y(self, y: Array) -> Array:
         """Restore the physical units of an output (T, ny); infinite where it is too large."""
-        with np.errstate(over="ignore"):  # of a simulation that diverges
+        with np.errstate(over="ignore"):  # a simulation may diverge
             return y * self.y_scale + self.y_offset
 
 

@@ -313,7 +313,7 @@ def _levels(name: str, given: float | Sequence[float]) -> list[float]:
 def _realisation(
     name: str, seed: int | list[int], *, samples: int, rms: float, noise_rms: float
 ) -> Record:
-    """One steady-state period by the official procedure, at any length of period.
+    """Steady-state period by the official procedure, of any length.
 
     The simulation starts from rest. Its transient is dropped: one period of 8192 samples, or
     shorter ones of the same length together. One more period follows, dropped for the filters'

@@ -58,7 +58,7 @@ class Ranks:
         return Ranks() if 1 < self.world <= starts else self
 
     def enough_for(self, items: int) -> Ranks:
-        """These processes; each alone, if there are fewer items than processes."""
+        """Processes for a number of items: all, or each alone if there are fewer items."""
         return self if items >= self.world else Ranks()
 
     def sum(self, part: Tensor) -> Tensor:

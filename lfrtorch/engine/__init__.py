@@ -1,1 +1,1 @@
-"""One trajectory of a model and its derivatives."""
+"""Trajectory of a model and its derivatives."""

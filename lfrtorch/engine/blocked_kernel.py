@@ -38,7 +38,7 @@ def blocked_rows(
     first, jobs, step, sizes, weights, code, u, x, z, w, r0, t0,
     x_entries, z_entries, y_entries, static, chunks, S, rows,
 ):  # fmt: skip
-    """``_rows`` of every job first, first + step, ... below ``jobs``."""
+    """Call ``_rows`` for every job first, first + step, ... below ``jobs``."""
     for job in range(first, jobs, step):
         _rows(
             job, sizes, weights, code, u, x, z, w, r0, t0, x_entries, z_entries, y_entries, static,
@@ -186,7 +186,7 @@ def _responses(AT, Cz, CyT, DywT, J, M, room, P, QW):
 
 @njit(nogil=True, fastmath={"contract"})
 def add_feedback(driveT, J, Cz, out):
-    """out += (drive J Cz)ᵀ."""
+    """Add (drive J Cz)ᵀ to out."""
     for i in range(Cz.shape[1]):
         for q in range(len(driveT)):
             a = out.dtype.type(0)
@@ -198,7 +198,7 @@ def add_feedback(driveT, J, Cz, out):
 
 @njit(nogil=True)
 def _sorted(x_entries, n_z, n_y, C, nx):
-    """All columns but those of y, which leave S alone, and where products of them begin.
+    """Columns but those of y, which leave S unchanged, and the beginnings of their products.
 
     Columns of x come first, by the state that they drive; also returned: each state's first one.
     Their products hold all columns of a state, as these share its P.

@@ -1,4 +1,4 @@
-"""One step of the NL-LFR model: an LTI block in feedback with a static nonlinearity."""
+"""Cell of the NL-LFR model: one step of an LTI block in feedback with a static nonlinearity."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Matrices(NamedTuple):
 
 
 class LFRCell(nn.Module):
-    """One time step (u, x) -> (y, x+) of the NL-LFR state-space model::
+    """Time step (u, x) -> (y, x+) of the NL-LFR state-space model::
 
         x+ = A  x + Bu  u + Bw  w
         z  = Cz x + Dzu u              (no Dzw: no algebraic loop)

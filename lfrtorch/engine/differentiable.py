@@ -110,7 +110,7 @@ class _Tangent(_Once):
 
 
 class Simulation(Function):
-    """y, x(T) and, without gradients, x, z and w, of a cell, u, x0 and the cell's weights."""
+    """Simulation from a cell, u, x0 and weights: y, x(T) and, without gradients, x, z and w."""
 
     @staticmethod
     def forward(

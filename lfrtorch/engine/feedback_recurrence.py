@@ -30,7 +30,7 @@ def states(
     *,
     backwards: bool = False,
 ) -> Float[Tensor, "R T+1 nx"]:
-    """All states of s(k+1) = F(k) s(k) + g(k) from the known s(0).
+    """States of s(k+1) = F(k) s(k) + g(k) from the known s(0).
 
     Backwards: costates of s(k) = F(k)ᵀ s(k+1) + g(k) from the known s(T).
     """

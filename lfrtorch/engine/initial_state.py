@@ -194,8 +194,8 @@ class _Prior(NamedTuple):
 
     white: Float[Array, "R nx nx"]
     spread: Float[Array, "R nx nx"]  # its inverse
-    variance: Float[Array, " R"]  # at rest: the largest
-    counted: Int[Integers, " R"]  # errors
+    variance: Float[Array, " R"]  # the largest, from the errors at rest
+    counted: Int[Integers, " R"]  # number of errors
 
 
 def _fitted_start(
@@ -236,7 +236,7 @@ def _fitted_by_torch(
     prior: _Prior,
     passes: int,
 ) -> Trajectory:
-    """``fit_starts`` of all records at once."""
+    """Search like ``fit_starts``, for all records at once."""
     x0, v = to_float64(best.x[:, 0]).copy(), np.zeros(len(u))
     seen = SEEN * to_float64(weight.abs().amax(dim=(1, 2)))
     tolerance = max(TOLERANCE, torch.finfo(u.dtype).eps)

@@ -24,7 +24,7 @@ def jacobian_rows(
     first, jobs, step, sizes, weights, code, u, x, z, w, r0, t0,
     x_entries, z_entries, y_entries, static, chunks, S, rows,
 ):  # fmt: skip
-    """``record_rows`` of every job first, first + step, ... below ``jobs``.
+    """Call ``record_rows`` for every job first, first + step, ... below ``jobs``.
 
     Job r * chunks + c is chunk c of the columns of record r0 + r.
 
@@ -120,7 +120,7 @@ def _padded(count, to):
 
 @njit(nogil=True, inline="always")
 def signals(x, u, w, t, v):
-    """v = [x; u; w] at sample t."""
+    """Write v = [x; u; w] at sample t."""
     nx, nu = x.shape[1], u.shape[1]
     for i in range(nx):
         v[i] = x[t, i]
@@ -133,7 +133,7 @@ def signals(x, u, w, t, v):
 # Loops instead of slices and masks, which take numba seconds to compile.
 @njit(nogil=True)
 def copy_to(source, target, column):
-    """target[:, column:] = source."""
+    """Copy source to target[:, column:]."""
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
             target[i, column + j] = source[i, j]

@@ -47,7 +47,7 @@ def filter_record(u, y, sizes, weights, code, G, x, U):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def correct_sample(u, y, sizes, weights, code, G, x, U, w_hat):
-    """``correct`` by the outputs of a sample, (nu,) and (ny,)."""
+    """Call ``correct`` with the input (nu,) and the outputs (ny,) of a sample."""
     _, _, Bw, Cz, Dzu, Cy, Dyu, Dyw, phi = matrices(sizes, weights)
     (nx, nw), ny = Bw.shape, len(Cy)
     e, H, by_x = np.empty(ny), np.empty((ny, nx)), np.empty((nw, nx))

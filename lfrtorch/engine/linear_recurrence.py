@@ -22,7 +22,7 @@ NOTHING = 1e-30
 def linear_recurrence(
     F: Float[Tensor, "R T n n"], g: Float[Tensor, "R T n m"], s0: Float[Tensor, "R n m"]
 ) -> Float[Tensor, "R T+1 n m"]:
-    """All states of s(k+1) = F(k) s(k) + g(k), s(0) = s0."""
+    """States of s(k+1) = F(k) s(k) + g(k), s(0) = s0."""
     if not has_kernels(F):
         return scan(F, g, s0)
     R, T, n, m = g.shape

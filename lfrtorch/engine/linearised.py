@@ -34,7 +34,7 @@ def linearise(model: LFRCell | Weights, z: Float[Tensor, "R T nz"]) -> Linearise
 def static_slope(
     model: LFRCell | Weights, z: Float[Tensor, "R T nz"]
 ) -> Float[Tensor, "R T nw nz"]:
-    """∂w/∂z of the static map at every sample."""
+    """Slope ∂w/∂z of the static map at every sample."""
     W = model.weights()
     return linearise_map(W.map, z, W.phi, W.layout.code).J
 

@@ -1,4 +1,4 @@
-"""All states of a simulation at once: Newton's method over the whole trajectory.
+"""Newton's method over the whole trajectory: all states of a simulation at once.
 
 x(k+1) = f(x(k), u(k)) at all k is one system of equations in all states. Its Newton step is the
 model linearised along the latest trajectory: a linear recurrence, which is parallel in time::

@@ -134,7 +134,7 @@ class Linearisation:
         return self.weights.layout.direct_terms(self.free[kept.cpu().numpy()])
 
     def signals(self, records: slice, time: slice) -> Float[Tensor, "R B v"]:
-        """v = [x; u; w]."""
+        """Signals v = [x; u; w]."""
         t = self.trajectory
         return torch.cat([s[records, time] for s in (t.x, self.u, t.w)], dim=-1)
 

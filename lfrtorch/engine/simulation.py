@@ -142,7 +142,7 @@ def steady_state(
     for passes in range(_MAX_PERIODS + 1):
         end = trajectory.x[:, -1].clone()
         if passes == 0:
-            size = 1.0 + trajectory.x.abs().amax(dim=(1, 2))  # of states that hardly change
+            size = 1.0 + trajectory.x.abs().amax(dim=(1, 2))  # the states hardly change
         lost |= ~torch.isfinite(end).all(dim=1)
         change = (end - x0).abs().amax(dim=1)
         settled = change <= tolerance * size

@@ -1,4 +1,4 @@
-"""One record of a model in machine code."""
+"""Simulation of a record in machine code."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def matrices(sizes, weights):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def simulate_records(first, jobs, step, sizes, weights, code, u, met_within, x, z, w, y):
-    """``simulate_record`` of every record first, first + step, ... below ``jobs``."""
+    """Call ``simulate_record`` for every record first, first + step, ... below ``jobs``."""
     for r in range(first, jobs, step):
         simulate_record(sizes, weights, code, u[r], met_within, x[r], z[r], w[r], y[r])
 

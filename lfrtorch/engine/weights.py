@@ -1,4 +1,4 @@
-"""All numbers of a model as one vector, and where each matrix and weight stands in it.
+"""Vector of all numbers of a model, and the position of each matrix and weight in it.
 
 Simulations and derivatives are functions of these numbers. Compiled loops take the vector itself;
 torch takes matrices, which are views of it.
@@ -151,7 +151,7 @@ class Weights:
         self.map = layout.static
 
     def weights(self) -> Weights:
-        """Itself, as a cell gives its own."""
+        """Weights: this object, as a cell has its own."""
         return self
 
     def __getattr__(self, name: str) -> Tensor:

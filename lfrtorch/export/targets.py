@@ -28,7 +28,7 @@ from lfrtorch.model.model import Disturbance, Model
 
 
 class Target(NamedTuple):
-    """One kind of export.
+    """Target of an export.
 
     Args:
         files: model and name -> text or bytes of each file by its name, in their order.

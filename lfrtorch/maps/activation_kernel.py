@@ -29,7 +29,7 @@ instructions, twice as fast as over 15 neurons."""
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"})
 def hidden(activation, nz, lanes, room, z, v):
-    """σ(v) and σ'(v) of all neurons with v = Wz z + bz, after room for v, which may stay empty.
+    """Values σ(v) and slopes σ'(v) of all neurons, v = Wz z + bz, behind room for v, maybe unused.
 
     Args:
         room: array that begins with Wzᵀ and bz, each of ``lanes`` entries a row.
@@ -144,7 +144,7 @@ _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9, _C10, _C11, _C12, _C13 = (
 
 @njit(nogil=True, inline="always")
 def _exp(v):
-    """exp(v) for v <= 0, to rounding: exp(v) = 2^k exp(r) with |r| <= ln(2) / 2.
+    """Exponential for v <= 0, to rounding: exp(v) = 2^k exp(r) with |r| <= ln(2) / 2.
 
     It has neither branch nor table, and is faster than the library's exp in a loop over neurons.
     """

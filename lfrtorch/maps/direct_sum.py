@@ -25,7 +25,7 @@ from lfrtorch.maps.static_map import StaticMap, Symmetry, as_map
 
 
 class DirectSum(StaticMap):
-    """w = [f1(z1); f2(z2); ...] of z = [z1; z2; ...].
+    """Direct sum w = [f1(z1); f2(z2); ...] of z = [z1; z2; ...].
 
     Args:
         parts: f1, f2, ...
@@ -46,7 +46,7 @@ class DirectSum(StaticMap):
         return [as_map(part, nz, nw) for part, (nz, nw) in pairs]
 
     def _placed(self) -> Iterator[tuple[StaticMap, slice, slice, slice]]:
-        """Each part, with the positions of its z, w and weights."""
+        """Parts, each with the positions of its z, w and weights."""
         z = w = P = 0
         for part in self.maps:
             count = sum(p.numel() for p in part.parameters())

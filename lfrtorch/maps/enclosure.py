@@ -85,7 +85,7 @@ class Enclosure(NamedTuple):
 
 
 def everywhere(size: int) -> Interval:
-    """All numbers."""
+    """Interval of all numbers."""
     return Interval(np.full(size, -FAR), np.full(size, FAR))
 
 

@@ -37,15 +37,15 @@ class TorchMap:
         self.J = static.slope(z, phi)
 
     def by_weight(self) -> Float[Tensor, "R T nw P"]:
-        """∂w/∂φ."""
+        """Derivatives ∂w/∂φ."""
         return self._static.by_weight(self._z, self._phi)
 
     def tangent(self, d_phi: Float[Tensor, " P"]) -> Float[Tensor, "R T nw"]:
-        """(∂w/∂φ) dφ."""
+        """Product (∂w/∂φ) dφ."""
         return self.by_weight() @ d_phi
 
     def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R P"]:
-        """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
+        """Product Σ_k (∂w/∂φ)ᵀ d_w(k)."""
         if not len(self._phi):
             return d_w[:, 0, :0]
 
@@ -74,7 +74,7 @@ class CompiledMap:
         return self._run(_tangent, np.empty(self._shape), to_float64(d_phi))
 
     def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R P"]:
-        """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
+        """Product Σ_k (∂w/∂φ)ᵀ d_w(k)."""
         out = np.zeros((len(d_w), len(self._phi)))
         return self._run(_adjoint, out, to_float64(d_w.contiguous()))
 

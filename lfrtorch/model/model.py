@@ -671,7 +671,7 @@ class Model:
         return E
 
     def to_model(self) -> Model:
-        """Itself, as a linear model gives its own.
+        """Return the model itself, as a linear model returns its own.
 
         Example:
             >>> model.to_model() is model
