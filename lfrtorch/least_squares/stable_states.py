@@ -38,7 +38,7 @@ _NEWTON = 10
 
 
 def fading(A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"]) -> Float[Tensor, "n n"]:
-    """A without the rows and columns of exact integrators, which do not act on the others."""
+    """Block of A without the exact integrators, which do not act on the other states."""
     return A.detach()[~integrating][:, ~integrating]
 
 
@@ -83,7 +83,7 @@ def within(
 
 
 class Stable:
-    """A's eigenvalues on the way of a search, which fade within a record."""
+    """Constraint of a search: states that fade within a record, by the eigenvalues of A."""
 
     # If they are not within the unit circle at the start, they stay within the circle that they are
     # in.
@@ -142,7 +142,7 @@ class PoleBounds:
     def tightened(
         self, step: Float[Tensor, " P"], room: Float[Tensor, " near"]
     ) -> Float[Tensor, " near"] | None:
-        """The room less what a step takes each pole beyond the limit; None if it takes none."""
+        """Reduce the room by the excess of each pole after a step; None if there is no excess."""
         dA = to_float64(step[: self.slopes.shape[1]])
         size = round(len(dA) ** 0.5)
         after = np.linalg.eigvals(self._A + dA.reshape(size, size)[np.ix_(self._own, self._own)])
