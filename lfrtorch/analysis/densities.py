@@ -59,7 +59,7 @@ def noise_of_periods(records: Sequence[Record]) -> Float[Array, " ny"] | None:
 def noise_density(
     record: Record,
 ) -> tuple[Float[Array, " F"], Float[Array, "F ny"], Float[Array, " ny"]] | None:
-    """Frequencies in Hz, power spectral densities and deviations of that noise, or None."""
+    """Frequencies in Hz, power spectral densities and deviations of the repeated noise, or None."""
     spectra = _steady_spectra([record])
     if spectra is None:
         return None

@@ -1,4 +1,4 @@
-"""Noise of the outputs as the residuals show it: autoregressive, of any colour.
+"""Noise model of the outputs, estimated from residuals: autoregressive, of any colour.
 
 The residuals of a fit are less than the noise, where the model is flexible more so than elsewhere:
 of the noise's power at a frequency a fit takes the part ρ(f) = Σ |q(f)|² / T, with q the
@@ -24,7 +24,7 @@ _SEGMENT = 1024
 """Longest stretch of which a spectrum is taken, in samples."""
 
 LEAST = 0.1
-"""Least part 1 - ρ of the noise that is taken to be left in the residuals."""
+"""Lower bound of the part 1 - ρ of the noise that remains in the residuals."""
 
 _NO_POWER = 1e-24
 """Power of prediction errors over the residuals' power, below which it is rounding."""
