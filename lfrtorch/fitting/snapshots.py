@@ -1,4 +1,4 @@
-"""The starts of a fit on disk, as far as they came, for a program that takes them up again."""
+"""Snapshots of the starts of a fit on disk, from which a program can continue."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Snapshots:
                 fit.restore(self._file(number))
 
     def keeper(self, number: int) -> Keep:
-        """Return what writes the file of a start when it is due."""
+        """Return a monitor that writes the file of a start when it is due."""
         due = monotonic() + self.every
 
         def keep(fit: Fit, paused: bool) -> None:
