@@ -76,7 +76,7 @@ class Rule(NamedTuple):
 
 
 def advise(evidence: Evidence) -> list[Advice]:
-    """All that the numbers suggest, the most useful first."""
+    """List the advice that the numbers suggest, the most useful first."""
     # At the noise, and where the inputs explain little, there is no advice on sizes and search.
     e = evidence
     without = e.noise_limited or e.nothing_left or e.unexplained
