@@ -57,7 +57,7 @@ from lfrtorch.reporting.verdict import LINEAR_MODEL
 
 
 def run(cfg: DictConfig, folder: Path, command: str = "") -> float:
-    """One run, its files written by the first process; returns the validation RMSE."""
+    """Identify and write files, by the first process alone; return the validation RMSE."""
     # A fit that ended early has its files written before the error of that.
     first = current().rank == 0
     cfg = chosen_before(cfg, folder)
@@ -151,7 +151,7 @@ class _Folder(Console):
 
 
 def main(cfg: DictConfig) -> float:
-    """The command line."""
+    """Run the command of the command line."""
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
     cfg.threads = sweep.threads(job, cfg.threads)
