@@ -148,7 +148,7 @@ def in_groups(command: str, given: Sequence[str]) -> list[str]:
 
 
 def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) -> DictConfig | None:
-    """What the words compose; refuse those that Hydra would not take, or that nothing would read.
+    """Compose the words; refuse those that Hydra would not take, or that nothing would read.
 
     Options of Hydra, as --help, compose nothing.
     """
@@ -202,7 +202,7 @@ def parsed(word: str) -> Override:
 
 
 def several_values(word: Override, cfg: DictConfig) -> str:
-    """What is wrong with values that are neither a list nor several runs."""
+    """Message on values that are neither a list nor several runs."""
     name, values = word.get_key_element(), word.get_value_string()
     listed = name.startswith("data.") or isinstance(OmegaConf.select(cfg, name), ListConfig)
     meant = f"for a list write {name}=[{values}], " if listed else ""

@@ -94,7 +94,7 @@ def show(path: Path, data: DictConfig, figure: Path) -> None:
 
 
 def beginning(seen: Measurement, test: Any) -> list[str]:
-    """How a fit would take the record to begin, if its linear models tell that."""
+    """Start of the record that a fit would take, if its linear models decide it."""
     T = len(seen.y) - (round(test * len(seen.y)) if is_fraction(test) else 0)
     u, y = seen.u[:T], seen.y[:T]
     if not seen.inputs or not np.isfinite(u).all() or find_period(u) is not None:
