@@ -52,7 +52,7 @@ class Equations:
         y  = Cy x + Dyu v + Dyw w + y_offset
 
     Args:
-        name: of the model in an export.
+        name: name of the model in an export.
         matrices: A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw; nz = nw = 0 of a linear model.
         u_offset, y_offset: operating point.
         x_rest: state at rest under u_offset, (nx,); empty if none was found. x = 0 is near it.
@@ -96,7 +96,7 @@ class Equations:
         return bool(M.Dyu.any()) or bool(M.Dyw.any() and M.Dzu.any())
 
     def about(self, place: str = "{0}[{1}]") -> list[str]:
-        """What a reader of the export should know: equations, channels, units, offsets, rate."""
+        """Description for readers of the export: equations, channels, units, offsets, rate."""
         # ``place`` is how its language writes a channel: letter {0}, number from 0 {1} and from 1
         # {2}.
         known = {"place": place, "version": version("lfrtorch"), "printable": printable}

@@ -33,7 +33,7 @@ class Target(NamedTuple):
     Args:
         files: model and name -> text or bytes of each file by its name, in their order.
         use: a line of a program that uses them, with {name} and the {path} of the first file.
-        follow: what ``use`` is with an observer, {path} being the last file; empty if there is no
+        follow: the same line with an observer, {path} being the last file; empty if there is no
             observer. ``files`` takes one then.
     """
 
@@ -68,7 +68,7 @@ def _casadi(
 
 
 def _saved(function: Any) -> str | bytes:
-    """What CasADi saves of a function; a text as it is."""
+    """Serialise a function as CasADi saves it; a text stays unchanged."""
     if isinstance(function, str):
         return function
     with tempfile.TemporaryDirectory() as folder:
