@@ -1,4 +1,4 @@
-"""What one file measured: the roles of its columns, their clock, and signals on an even grid.
+"""Measurement in one file: the roles of its columns, their clock, and signals on an even grid.
 
 :func:`read_measurement` refuses what a model cannot be fitted to; :func:`look_at` takes the
 beginning of any file, and says what is odd.
