@@ -233,8 +233,8 @@ def choose_sizes(
         given: sizes that are known.
         ridge: the one of all fits. Default: it is chosen, too.
         last: name of the last size, nn or degree; nw if the map has no other.
-        seed: of the first start; the second has seed + 1000.
-        guarantee: of the trainer.
+        seed: seed of the first start; the second has seed + 1000.
+        guarantee: guarantee of the trainer.
         horizon: samples ahead that records with a measured start are fitted and judged by. Default:
             they are simulated from the first output on.
         watch: called with a line after each size.

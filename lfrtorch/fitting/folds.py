@@ -29,7 +29,7 @@ class Fold(NamedTuple):
     Args:
         train: the records, their measurements masked where they are left out.
         windows: first sample and the one after the last, of each record; equal if none is left out.
-        begun: what is left out of each as a record that begins there, in an estimated state; None
+        begun: left out samples of each as a record that begins in an estimated state; None
             if that is too little to tell a state and score the rest. Of a measured start it begins
             a horizon before, at the output that the first prediction needs.
     """

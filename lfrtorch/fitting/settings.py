@@ -210,7 +210,7 @@ class Settings(PlainSettings):
 
     @property
     def learns(self) -> bool:
-        """Whether a map or states are learned, of a known model those beside it."""
+        """True if a map or states are learned; beside a known model, those of the learned part."""
         return self.known is None or bool(self.nn or self.nx or self.static != "network")
 
     @property

@@ -97,7 +97,7 @@ def windows(
 
 
 def begins_at_outputs(records: Sequence[Record]) -> bool:
-    """Whether all records have measured starts; a ValueError if some have."""
+    """Tell if all records have measured starts; a ValueError if some have."""
     measured = {record.start == "measured" for record in records}
     if len(measured) > 1:
         raise InputError(
