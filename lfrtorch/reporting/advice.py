@@ -1,4 +1,4 @@
-"""What to try next after a fit, from numbers alone: a table of rules, a row each.
+"""Advice after a fit, from numbers alone: a table of rules, a row each.
 
 The numbers, and the thresholds that several rules share, are those of
 :mod:`lfrtorch.reporting.diagnosis`.
@@ -66,7 +66,7 @@ class Rule(NamedTuple):
     instead: str = ""  # of the change in the sentence, if there is none
 
     def __call__(self, e: Evidence) -> Advice | None:
-        """What it advises, if anything."""
+        """Advice of the rule, if there is any."""
         if not self.when(e):
             return None
         change = self.change(e)
@@ -96,7 +96,7 @@ def _of_ridge(e: Evidence) -> dict[str, Any]:
 
 
 def _overfit(e: Evidence) -> str:
-    """How the error grows beyond training, or while training goes on; empty if it does not."""
+    """Growth of the error beyond training, or while training goes on; empty if there is none."""
     part, growth = max(e.growths.items(), key=lambda item: item[1], default=("", 0.0))
     if growth <= OVERFIT:
         return (
@@ -139,13 +139,13 @@ def _longer(e: Evidence) -> dict[str, Any]:
 
 
 def _map_is_small(e: Evidence) -> bool:
-    """Whether an error that is not noise says so."""
+    """Tell if there is evidence that the error is not noise."""
     other = e.useless or e.lost_on_tests or e.states_missing or e.overtrained
     return e.gain is not None and not other
 
 
 def _not_noise(e: Evidence) -> str:
-    """What shows that the error is not noise; empty if nothing does."""
+    """Evidence that the error is not noise; empty if there is none."""
     if not e.noise or e.train is None:
         part = f"explain {percent(e.nonlinear)} of the error's power"
         return f"squares and cubes of the outputs {part}" * _above(e.nonlinear, NONLINEAR)
@@ -161,7 +161,7 @@ def _far(e: Evidence) -> dict[str, float]:
 
 
 def _louder(e: Evidence) -> str:
-    """How loud these are, and how far the starts differ there."""
+    """Text on the inputs of louder tests, and on the difference of the starts there."""
     ratios = _listed(f"'{name}' up to {number(ratio)} times" for name, ratio in _far(e).items())
     apart = max((e.apart.get(name, 0.0) for name in _far(e)), default=0.0)
     more = f"; by {percent(apart)} of the output's deviation the starts differ there" * bool(apart)

@@ -63,7 +63,7 @@ class Score:
 
     @property
     def start_matters(self) -> bool:
-        """Whether the uncertainty of the start state makes a part of the error that is seen."""
+        """True if the uncertainty of the start state is a visible part of the error."""
         added, error = self.start_error, self.rmse
         return added is not None and error is not None and added > 0.2 * error  # 2 % of its power
 
@@ -97,7 +97,7 @@ def finite(entry: Any) -> Any:
 
 
 def of_samples(scored: int, samples: int, skip: int, records: int = 1) -> str:
-    """Which samples count, in words: the last ones of a record."""
+    """Scored samples, in words: the last ones of a record."""
     if not scored:
         return "not scored"
     last = skip and scored == samples - skip and records == 1

@@ -86,7 +86,7 @@ class Run:
 
     @property
     def origins(self) -> list[str]:
-        """What became of the best starts, if the model is not simply one of them."""
+        """Use of the best starts, if the model is not simply one of them."""
         mean = f"The model is the mean of the best {self.fit.averaged} starts."
         again = "Refitted to all estimation records: validation errors are those before it."
         return [mean] * (self.fit.averaged > 1) + [again] * (self.refit is not None)

@@ -66,12 +66,12 @@ def _error(row: Row) -> tables.Cell:
 
 
 def _start(row: Row) -> tables.Cell:
-    """What the uncertainty of the start adds, if that matters."""
+    """Part of the error by the uncertainty of the start, if that matters."""
     return row.scaled(row.score.start_error) if row.score.start_matters else None
 
 
 def _published(of: Published, row: Row) -> tables.Cell:
-    """What was published of a test."""
+    """Published scores of a test."""
     known = of.scores.get(row.key) if row.score.use == "test" else None
     return row.scaled(known)
 

@@ -171,7 +171,7 @@ def linear_name(evaluation: Evaluation) -> str:
 
 
 def own_linear(evaluation: Evaluation) -> list[str]:
-    """Which tests have a linear model of their own, and of which records."""
+    """Tests with a linear model of their own, and the records of these."""
     linear = {name: evaluation.dataset.linear[name] for name in evaluation.own}
     models = [
         f"{name} of {'+'.join(of) if len(of) <= LISTED else f'{len(of)} training records'}"
