@@ -117,7 +117,7 @@ _SENTENCES = {
     "times that before, at inputs of the same level:\na setting or the system may have changed; "
     "if so, cut the record there, or give what changed as an input.",
 }
-"""What may be wrong, by its kind, and what to do."""
+"""Possible faults by kind, with remedies."""
 
 _CONSTANT = {
     "alone": ": it tells nothing.",
@@ -127,7 +127,7 @@ _CONSTANT = {
     "input": ": it tells nothing, unless it differs in other records; leave it out of the inputs "
     "if it does not.",
 }
-"""What a constant signal means, by its use."""
+"""Meaning of a constant signal, by its use."""
 
 
 class Note(NamedTuple):
@@ -348,7 +348,7 @@ def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
 def _relations(
     found: Survey, u: Array, y: Array, skipped: int, given: Mapping[str, Any]
 ) -> Iterator[Note]:
-    """How outputs (T, ny) without gaps follow inputs (T, nu): order, delay, drift, changes."""
+    """Notes on outputs (T, ny) without gaps under inputs (T, nu): order, delay, drift, changes."""
     inputs = [one.channel.name for one in found.inputs]
     outputs = [one.channel.name for one in found.outputs]
     between = {
