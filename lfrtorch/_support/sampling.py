@@ -99,7 +99,7 @@ class EvenTimes(NamedTuple):
 
     @property
     def tolerance(self) -> float:
-        """How far the rate of the time stamps may be off, relative."""
+        """Relative uncertainty of the rate of the time stamps."""
         return _USUAL if self.uneven else max(_SAME, self.grid.uncertainty)
 
 

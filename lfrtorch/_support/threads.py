@@ -172,12 +172,12 @@ COMPILED_ON = {"cpu"}
 
 
 def fast_paths() -> bool:
-    """Whether there are quick ways: machine code, a search from states close by, kept results."""
+    """Tell if fast paths are on: machine code, a search from nearby states, kept results."""
     return not os.environ.get(SLOW_PATHS)
 
 
 def has_kernels(tensor: Tensor) -> bool:
-    """Whether compiled kernels serve the tensor's device."""
+    """Tell if the tensor's device has compiled kernels."""
     return tensor.device.type in COMPILED_ON and fast_paths()
 
 

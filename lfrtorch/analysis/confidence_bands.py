@@ -507,7 +507,7 @@ def _doubts(
 def _clipped(
     every: Sequence[Gradients], scatter: Float[Tensor, "K m"], noise: Float[Tensor, " ny"]
 ) -> tuple[str, ...]:
-    """How far noise that the limits of a sensor cut off has shifted the fit, if that is far."""
+    """Shift of the fit by noise that the limits of a sensor cut off, if it is large."""
     K, total = len(scatter), scatter.new_zeros(len(scatter))
     for along in every:
         if along.group.limits is None or not noise.all():

@@ -158,7 +158,7 @@ class ReducedSystem:
 
 
 def largest_eigenvalue(G: Float[Tensor, "P P"]) -> float:
-    """Of a symmetric matrix; of a large one by a Krylov subspace, some thirty products with it."""
+    """Largest eigenvalue of a symmetric matrix; by some thirty products (Krylov) if it is large."""
     if len(G) < KRYLOV or not has_kernels(G):
         return float(torch.linalg.eigvalsh(G)[-1])
     start = np.ones(len(G), G.numpy().dtype)  # ARPACK's own would be random

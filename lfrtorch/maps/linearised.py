@@ -79,7 +79,7 @@ class CompiledMap:
         return self._run(_adjoint, out, to_float64(d_w.contiguous()))
 
     def _run(self, kernel: Callable[..., None], out: Array, given: Any) -> Tensor:
-        """What a loop over the records writes of what it is given."""
+        """Run a loop over the records, and return the array that it writes."""
         spread_loop(kernel, len(out), self._code.arguments, self._phi, self._z, given, out)
         return torch.from_numpy(out).to(self._dtype)
 

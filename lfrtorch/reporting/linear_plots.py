@@ -23,9 +23,9 @@ from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
 
+# Colours of all that is drawn.
 MEASURED, TOTAL, _, EVEN, DIFFERENCE, _ = CHANNELS
 MODEL, NOISE, ODD = "black", "0.5", TOTAL
-"""Colours of what is drawn."""
 
 _GRID = 500  # frequencies at which a model is drawn, beside those of its poles
 _LOWEST = 1e-3  # first frequency of a model drawn alone, relative to half the sampling frequency
