@@ -32,9 +32,12 @@ class FrameTable(Table):
         for part in self._frames([*columns], samples):
             found = np.empty((len(part), len(columns)))
             for i, clock in enumerate(clocks):
-                dated = part.dtypes.iloc[i].kind == "M"
-                dates = part.iloc[:, i].to_numpy("M8[ns]") if dated else None
-                found[:, i] = columns_of(part, [i])[:, 0] if dates is None else clock(dates)
+                column = part.iloc[:, i]
+                dated, plain = column.dtype.kind == "M", column.dtype == np.float64
+                if dated:
+                    found[:, i] = clock(column.to_numpy("M8[ns]"))
+                else:
+                    found[:, i] = column if plain else columns_of(part, [i])[:, 0]
             yield found
 
     def labels(self, column: int) -> NDArray[Any]:
@@ -95,7 +98,7 @@ def parquet(path: Path) -> FrameTable:
             # Read ahead, the whole file would come to be in memory.
             with pq.ParquetFile(path, pre_buffer=False) as file:
                 for batch in file.iter_batches(samples, columns=list(dict.fromkeys(names))):
-                    yield batch.to_pandas(ignore_metadata=True)[names]
+                    yield batch.select(names).to_pandas(ignore_metadata=True)
         except (pa.ArrowException, OSError) as error:
             raise damaged(error) from error
 
