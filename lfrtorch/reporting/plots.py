@@ -227,12 +227,15 @@ def _overlay(
     numbers = list(range(record.y.shape[1]) if outputs is None else outputs)
     height = _HEIGHT * len(numbers) + _INPUTS * fits
     ratios = [1] * fits + [2, 1] * len(numbers)
-    figure, grid = panels((width, height), len(ratios), sharex=True, height_ratios=ratios)
-    axes: list[Axes] = [*grid[:, 0]]
+    figure = Figure(figsize=(width, height), layout="constrained")
+    grid = figure.add_gridspec(len(ratios), 1, height_ratios=ratios)
+    axes: list[Axes] = []
+    for row in range(fits, len(ratios)):
+        axes.append(figure.add_subplot(grid[row], sharex=axes[0] if axes else None))
     scored = slice(record.skip, None)
     t = (record.skip + np.arange(record.samples - record.skip)[part]) / record.fs
     for k, i in enumerate(numbers):
-        above, below = axes[2 * k + fits : 2 * k + fits + 2]
+        above, below = axes[2 * k : 2 * k + 2]
         y, output = record.y[scored, i], record.outputs[i]
         above.plot(*envelope(t, y[part]), lw=1.6, color=OUTPUT, label="measured")
         reach = 0.0
@@ -257,13 +260,15 @@ def _overlay(
             ax.grid(True, alpha=0.2)
         legend_above(above)
     if fits:
-        above = axes[0]
+        above = figure.add_subplot(grid[0], sharex=axes[0])
         for i, channel in enumerate(record.inputs[:_MOST_INPUTS]):
             above.plot(*envelope(t, record.u[scored, i][part]), lw=0.8, label=str(channel))
         above.set_ylabel("input")
-        above.margins(x=0)
         above.grid(True, alpha=0.2)
         legend_above(above)
+        axes.insert(0, above)
+    for ax in axes[:-1]:
+        ax.tick_params(labelbottom=False)
     figure.align_ylabels(axes)
     figure.suptitle(f"{record.name} ({record.source})", fontsize="medium")
     axes[-1].set_xlabel("time in the record (s)" if record.fs != 1.0 else "sample of the record")
