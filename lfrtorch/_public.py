@@ -22,7 +22,8 @@ from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.maps.static_map import StaticMap
 from lfrtorch.model.extended_kalman_filter import NoiseCovariance
 from lfrtorch.model.known import Known, Parameter, State
-from lfrtorch.model.model import Model, load, simulate_blocks
+from lfrtorch.model.loading import load
+from lfrtorch.model.model import Model, simulate_blocks
 
 # fits
 from lfrtorch.fitting.forgetting import Memory, forgets

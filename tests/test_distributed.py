@@ -37,7 +37,8 @@ from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
 from lfrtorch.least_squares.shared_problem import problem_of
-from lfrtorch.model.model import Model, load
+from lfrtorch.model.loading import load
+from lfrtorch.model.model import Model
 from lfrtorch.reporting.monitor import Checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]

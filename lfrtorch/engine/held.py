@@ -20,6 +20,9 @@ STRUCTURES = ("free", "wiener", "hammerstein", "wiener_hammerstein", "parallel")
 IN_SERIES = ("wiener_hammerstein", "parallel")
 """Structures whose states are divided into those before and those behind the static map."""
 
+TIED = {"A": "Cy", "Bu": "Dyu", "Bw": "Dyw"}
+"""Matrices of the state equation, and those that K multiplies in a predictor's."""
+
 
 def structure(cell: LFRCell, kind: str, *, before: int | None = None) -> Held:
     """Zeros of a block structure.

@@ -29,10 +29,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lfrtorch.engine.cell import LFRCell, Matrices
-from lfrtorch.engine.held import past_outputs
-
-TIED = {"A": "Cy", "Bu": "Dyu", "Bw": "Dyw"}
-"""Matrices of the state equation, each with the one that K multiplies in a predictor."""
+from lfrtorch.engine.held import TIED, past_outputs
 
 
 def predictor_cell(cell: LFRCell, K: Float[Tensor, "nx ny"]) -> LFRCell:

@@ -53,7 +53,7 @@ from lfrtorch.fitting.forgetting import forgets
 from lfrtorch.fitting.side_by_side import any_of
 from lfrtorch.fitting.trainer import Stop, StoppedError
 from lfrtorch.fitting.windows import begins_at_outputs, in_windows, windows
-from lfrtorch.least_squares.guarantee import Name
+from lfrtorch.least_squares.guarantee import Name, guarantee_of
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
@@ -523,8 +523,10 @@ class _Study:
         fold, train = self._folds[k], self._folds[k].train
         if self._horizon is not None:
             train = windows(train, self._horizon, model.lfr.cell.nx, y_scale=model.scaler.y_scale)
+        longest = max(record.samples for record in fold.train)
+        guarantee = partial(guarantee_of, self._guarantee, longest)
         try:
-            problem = Problem.of(model, train, guarantee=self._guarantee)
+            problem = Problem.of(model, train, guarantee=guarantee)
         except InputError:  # it diverges on what it is fitted to
             lost = np.full_like(linear.outputs[k], np.inf)
             yield from [_Step(np.inf, lost, lost, False)] * len(self._ridges)

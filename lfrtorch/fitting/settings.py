@@ -16,8 +16,7 @@ from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.settings import check_settings, documented, setting
 from lfrtorch.engine.cell import check_dtype
-from lfrtorch.engine.held import IN_SERIES
-from lfrtorch.engine.innovation import TIED
+from lfrtorch.engine.held import IN_SERIES, TIED
 from lfrtorch.engine.weights import MATRICES
 from lfrtorch.fitting.exclusions import USUAL, refuse_together
 from lfrtorch.fitting.plain_settings import PlainSettings, Size

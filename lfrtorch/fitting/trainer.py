@@ -22,9 +22,10 @@ from lfrtorch.distributed import ProcessLostError
 from lfrtorch.fitting import state_file
 from lfrtorch.fitting.fit_state import FitState, Progress
 from lfrtorch.fitting.windows import windows
-from lfrtorch.least_squares.guarantee import Name
-from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, Point
+from lfrtorch.least_squares.guarantee import Name, guarantee_of
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
+from lfrtorch.least_squares.residual import Point
 from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.least_squares.search import Search
 from lfrtorch.least_squares.shared_problem import problem_of
@@ -189,15 +190,15 @@ class Fit:
     ) -> None:
         self.model, self.keep, self._stop = model, keep, stop
         self.trainer = LevenbergMarquardt() if trainer is None else trainer
-        guarantee = self.trainer.guarantee
         longest = max(record.samples for record in as_records(train))
+        guarantee = partial(guarantee_of, self.trainer.guarantee, longest)
         if horizon is not None:
             nx = model.lfr.cell.nx
             cut = partial(windows, horizon=horizon, nx=nx, y_scale=model.scaler.y_scale)
             train = cut(as_records(train))
             if validation:
                 validation = cut(as_records(validation), fitted=False)
-        self.problem = problem_of(model, train, ridge=ridge, guarantee=guarantee, longest=longest)
+        self.problem = problem_of(model, train, ridge=ridge, guarantee=guarantee)
         self.judge = Problem.judge(model, validation) if validation else None
         self.at: FitState | None = None
         """Where it stands; None before the first call of ``advance``."""

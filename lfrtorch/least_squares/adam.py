@@ -16,8 +16,8 @@ from torch import Tensor
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.settings import documented
-from lfrtorch.least_squares.levenberg_marquardt import Point
 from lfrtorch.least_squares.options import AdamOptions
+from lfrtorch.least_squares.residual import Point
 
 
 class Differentiable(Protocol):

@@ -32,8 +32,9 @@ class Guarantee(Protocol):
         ...
 
 
-def guarantee_of(name: Name | None, cell: LFRCell, samples: int) -> Guarantee | None:
+def guarantee_of(name: Name | None, samples: int, cell: LFRCell) -> Guarantee | None:
     """The guarantee of a name; None if there is none, or nothing that could break it."""
+    # ``samples``: of the longest record before they were cut into windows.
     if isinstance(name, float):
         check_guarantee(name)
     if name == "contracting" or isinstance(name, float):

@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.held import held_parameters
-from lfrtorch.engine.innovation import TIED
+from lfrtorch.engine.held import TIED, held_parameters
 from lfrtorch.engine.weights import Held
 from lfrtorch.least_squares.linear_systems import System
 from lfrtorch.least_squares.simulation_errors import Parameters

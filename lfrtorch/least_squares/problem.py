@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -15,19 +15,20 @@ from torch import Tensor
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.data.records import Record, as_records, of_one_unit
-from lfrtorch.engine.lfr import LFR
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
-from lfrtorch.least_squares.guarantee import Guarantee, Name, guarantee_of
 from lfrtorch.least_squares.held_steps import HeldSteps
 from lfrtorch.least_squares.jacobian import Jacobian
-from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, Point
 from lfrtorch.least_squares.record_groups import EVERY
+from lfrtorch.least_squares.residual import LeastSquares, Point
 from lfrtorch.least_squares.ridge import Ridge, RidgePenalty, ridge_by_entry
 from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.least_squares.term import Term
 
 if TYPE_CHECKING:
+    from lfrtorch.engine.cell import LFRCell
+    from lfrtorch.engine.lfr import LFR
+    from lfrtorch.least_squares.guarantee import Guarantee
     from lfrtorch.model.model import Model
 
 State = TypeVar("State")
@@ -71,17 +72,12 @@ class Problem(LeastSquares):
         records: Record | Sequence[Record],
         *,
         ridge: Ridge = 0.0,
-        guarantee: Name | None = None,
-        longest: int | None = None,
+        guarantee: Callable[[LFRCell], Guarantee | None] = lambda cell: None,
     ) -> Self:
         """The simulation errors of a model over records of its channels and rate."""
-        # ``longest``: samples of the longest record before they were cut into windows, which
-        # ``"stable"`` goes by.
         data = as_records(records)
         errors = errors_of(model, data, own=cls._share(model, data))
-        longest = longest or max(record.samples for record in data)
-        kept = guarantee_of(guarantee, model.lfr.cell, longest)
-        return cls(model.lfr, errors, ridge=ridge, guarantee=kept)
+        return cls(model.lfr, errors, ridge=ridge, guarantee=guarantee(model.lfr.cell))
 
     @classmethod
     def judge(cls, model: Model, records: Record | Sequence[Record]) -> Self:

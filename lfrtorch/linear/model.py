@@ -21,7 +21,6 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import linear_text, listed
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.operating_point import StateSpace, linear_part
-from lfrtorch.linear.balancing import in_coordinates
 from lfrtorch.linear.control import control_system
 from lfrtorch.linear.resolvent import (
     frequency_response,
@@ -29,7 +28,8 @@ from lfrtorch.linear.resolvent import (
     unit_circle,
 )
 from lfrtorch.linear.zeros import finite_zeros
-from lfrtorch.model.model import Model, read_model, write_model
+from lfrtorch.model.checkpoint import MapMaker, read_model
+from lfrtorch.model.model import Model, write_model
 
 
 @dataclass(frozen=True)
@@ -174,17 +174,30 @@ class LinearModel:
 
     def transformed(self, T: Array, inverse: Array | None = None) -> LinearModel:
         """The same system in the coordinates T x; ``inverse`` is T⁻¹, if it is known better."""
-        return replace(self, **in_coordinates(self, T, inverse))
+        back = np.asarray(np.linalg.inv(T) if inverse is None else inverse, dtype=np.float64)
+        covariance, P = self.covariance, self.state_covariance
+        if covariance is not None:
+            nu, ny = np.eye(len(self.inputs)), np.eye(len(self.outputs))
+            blocks = np.kron(T, back.T), np.kron(T, nu), np.kron(ny, back.T), np.kron(ny, nu)
+            change = scipy.linalg.block_diag(*blocks)
+            covariance = change @ covariance @ change.T
+        return replace(
+            self,
+            A=T @ self.A @ back,
+            B=T @ self.B,
+            C=self.C @ back,
+            K=None if self.K is None else T @ self.K,
+            covariance=covariance,
+            state_covariance=None if P is None else T @ P @ T.T,
+            x_offset=None if self.x_offset is None else T @ self.x_offset,
+        )
 
     def write(self, cell: LFRCell, scaler: Scaler) -> None:
         """Put A, B, C, D into A, Bu, Cy, Dyu of a cell, in the scaler's normalised units."""
         u, y = scaler.u_scale, scaler.y_scale[:, None]
-        with torch.no_grad():
-            B, C, D = self.B * u, self.C / y, self.D * u / y
-            for p, value in ((cell.A, self.A), (cell.Bu, B), (cell.Cy, C), (cell.Dyu, D)):
-                p.copy_(torch.as_tensor(np.ascontiguousarray(value)))
-            if self.state_covariance is not None:
-                cell.state_covariance.copy_(torch.as_tensor(self.state_covariance))
+        _put(cell, self.A, self.B * u, self.C / y, self.D * u / y)
+        if self.state_covariance is not None:
+            cell.state_covariance.copy_(torch.as_tensor(self.state_covariance))
 
     def to_model(self, y_scale: Array | None = None) -> Model:
         """The same as a ``Model``, in the same coordinates; outputs of these scales, or of 1."""
@@ -212,7 +225,15 @@ class LinearModel:
     @classmethod
     def load(cls, folder: str | Path) -> Self:
         """The linear model in a checkpoint folder, or in the ``linear/`` folder of a run's."""
-        model, about, known = read_model(folder, inside=("linear", "model"))
+
+        def maker_of(own: Any) -> MapMaker:
+            if isinstance(own, dict):
+                raise InputError(
+                    f"'{folder}' holds no linear model; lfrtorch.load reads an NL-LFR."
+                )
+            return lambda *_: None
+
+        model, about, known = read_model(folder, maker_of, ("linear", "model"))
         return replace(cls.of(model), **_known(folder, model, about, known))
 
 
@@ -235,8 +256,6 @@ def _known(
 ) -> dict[str, Any]:
     """Description of a linear model in a checkpoint, beside its numbers."""
     cell = model.lfr.cell
-    if cell.nw:
-        raise InputError(f"'{folder}' holds no linear model; lfrtorch.load reads an NL-LFR.")
     try:
         fit = None if about is None else about["fit"]
         if fit is not None:
@@ -258,7 +277,11 @@ def _known(
 def linear_cell(A: Array, B: Array, C: Array, D: Array) -> LFRCell:
     """Return a cell without static nonlinearity."""
     cell = LFRCell(B.shape[1], C.shape[0], len(A), dtype=torch.float64, random=False)
-    with torch.no_grad():
-        for parameter, value in ((cell.A, A), (cell.Bu, B), (cell.Cy, C), (cell.Dyu, D)):
-            parameter.copy_(torch.as_tensor(np.ascontiguousarray(value)))
+    _put(cell, A, B, C, D)
     return cell
+
+
+@torch.no_grad()
+def _put(cell: LFRCell, *matrices: Array) -> None:
+    for name, value in zip(("A", "Bu", "Cy", "Dyu"), matrices, strict=True):
+        cell.get_parameter(name).copy_(torch.as_tensor(np.ascontiguousarray(value)))

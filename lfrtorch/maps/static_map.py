@@ -8,7 +8,7 @@ with nz = 0.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -20,12 +20,15 @@ from torch.nn import Module
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.maps.enclosure import Enclosure, Interval
 from lfrtorch.maps.formula_code import machine_code
 from lfrtorch.maps.machine_code import NOTHING, SLOPE, Code, address, call_formula
-from lfrtorch.maps.mean_slopes import Neurons, Quadrature
+from lfrtorch.maps.mean_slopes import Quadrature
 from lfrtorch.maps.operations import Formula, Symbol
 from lfrtorch.maps.written import Written
+
+if TYPE_CHECKING:
+    from lfrtorch.maps.enclosure import Enclosure, Interval
+    from lfrtorch.maps.mean_slopes import Neurons
 
 
 class Symmetry(NamedTuple):

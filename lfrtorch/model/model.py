@@ -13,14 +13,13 @@ import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 from torch import Tensor
-from torch.nn import Module
 
 from lfrtorch._support import checkpoint
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, reals
-from lfrtorch._support.errors import InputError, brief
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.frames import check_index, columns_of, framed, is_frame, places_of
-from lfrtorch._support.old_checkpoints import SCALING, innermost, of_today
+from lfrtorch._support.old_checkpoints import SCALING
 from lfrtorch._support.types import Array
 from lfrtorch.data.records import (
     Channel,
@@ -32,11 +31,8 @@ from lfrtorch.data.records import (
     as_signal,
     check_rate,
     check_start,
-    described_channels,
     with_past_outputs,
 )
-from lfrtorch.engine import held
-from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, levels, listed, system_lines
 from lfrtorch.engine.disturbance import (
     disturbance_scale,
@@ -53,9 +49,8 @@ from lfrtorch.engine.operating_point import double, equilibrium, linear_part, li
 from lfrtorch.engine.record_starts import begun
 from lfrtorch.engine.resampling import resampled_cell
 from lfrtorch.engine.simulation import Trajectory, simulate
-from lfrtorch.maps.descriptions import foreign, made
 from lfrtorch.maps.static_map import StaticMap
-from lfrtorch.model.data_reach import Cloud, DataReach
+from lfrtorch.model.data_reach import DataReach
 from lfrtorch.model.extended_kalman_filter import (
     ExtendedKalmanFilter,
     NoiseCovariance,
@@ -820,29 +815,6 @@ def state_moment(model: Model, records: Record | Sequence[Record]) -> Float[Tens
     return (total + total.mT) / (2 * samples)
 
 
-@typed()
-def load(folder: str | Path, *, static: Module | None = None) -> Model:
-    """The model in a checkpoint folder, or in the ``model/`` folder of a run's folder.
-
-    A linear model is one without a static map; ``LinearModel.load`` has its covariance as well.
-
-    Args:
-        folder: where it was saved.
-        static: the module of the static nonlinearity, if it is of the user's own class: a
-            checkpoint holds weights, never code.
-
-    Raises:
-        ValueError: no checkpoint, a damaged one, one of another program or a newer version, or a
-            file that may carry code (it is not opened).
-
-    Example:
-        >>> folder = model.save("model")
-        >>> lfrtorch.load(folder).sizes
-        {'nx': 1, 'nz': 1, 'nw': 1, 'nn': 4}
-    """
-    return read_model(folder, static=static)[0]
-
-
 def write_model(
     folder: str | Path,
     model: Model,
@@ -870,78 +842,6 @@ def write_model(
     if model.reach is not None:
         weights |= {f"reach.{name}": torch.tensor(v) for name, v in _flat(model.reach).items()}
     return checkpoint.write(folder, description, weights)
-
-
-def read_model(
-    folder: str | Path, *, static: Module | None = None, inside: Sequence[str] = ("model", "linear")
-) -> tuple[Model, dict[str, Any] | None, dict[str, Tensor]]:
-    """Model in a checkpoint, with ``about`` and ``known`` of a linear one."""
-    description, weights = checkpoint.read(folder, inside)
-    own, _ = innermost(description)
-    if not static and (name := foreign(own)):
-        raise InputError(
-            f"'{folder}' holds a static nonlinearity of class {name}, which is not part of this "
-            "package; pass an instance of it: load(folder, static=...)."
-        )
-    if isinstance(own, dict) and own.get("layers", 1) != 1:
-        raise InputError(
-            f"'{folder}' holds a network of {own['layers']} hidden layers, and this version has "
-            "networks of one.\nVersions of 0.1.0 from before 2026-11-25 (commit 84a9d8a) read it; "
-            "or fit again with a torch module of your own: static=own."
-        )
-    try:
-        description, weights = of_today(description, weights)
-        known = _under(weights, "linear.")
-        about = description.get("linear")
-        if not isinstance(about, dict | None):
-            raise InputError(f"linear is {about!r}")
-        return _made(description, weights, static), about, known
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        raise InputError(
-            f"'{folder}' is damaged: its description and weights do not fit ({brief(error)})."
-        ) from None
-
-
-def _made(description: dict[str, Any], weights: dict[str, Tensor], static: Module | None) -> Model:
-    """Model from a description and its weights."""
-    sizes, dtype = description["sizes"], getattr(torch, description["dtype"])
-    if not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
-        raise InputError(f"dtype is {description['dtype']}")
-    lost = [n for n, w in weights.items() if not n.endswith(".bounds") and not w.isfinite().all()]
-    if lost:
-        raise InputError(f"{', '.join(lost)} have numbers that are not finite")
-    scaler = Scaler(*(weights.pop(f"scaler.{name}").numpy() for name in SCALING))
-    if weights["A"].shape != (sizes["nx"],) * 2:
-        raise InputError("they are of other sizes")
-    static = made(description["static"], sizes["nz"], sizes["nw"], dtype, static)
-    cell = LFRCell(**sizes, static=static, dtype=dtype, random=False).to(dtype)
-    K, masks, parts = weights.pop("K", None), _under(weights, "fixed."), _under(weights, "reach.")
-    reach = None
-    if parts:
-        names = ("u", "y", "middle", "axes", "ends", "farthest")
-        of_u, of_y, middle, axes, ends, far = (parts[name].numpy() for name in names)
-        reach = DataReach(of_u, of_y, Cloud(middle, axes, ends, float(far)))
-    cell.load_state_dict(weights)
-    named = description.get("structure", "free")
-    if named not in held.STRUCTURES:
-        raise InputError(f"structure is {named!r}")
-    z, y = (description.get(name, True) for name in ("z_feedthrough", "feedthrough"))
-    for given in (
-        {name: (mask != 0, cell.get_parameter(name).detach()) for name, mask in masks.items()},
-        held.structure(cell, named),  # as below: only checkpoints of earlier versions have it
-        held.no_feedthrough(cell, z=z, y=y),
-        held.integrators(cell) if cell.nw else {},
-    ):
-        cell.hold(given)
-    inputs, outputs = (described_channels(description[side]) for side in ("inputs", "outputs"))
-    about = float(description["fs"]), inputs, outputs, str(description.get("fitted_to", ""))
-    return Model(LFR(cell), scaler, *about, K, reach)
-
-
-def _under(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Select the tensors whose names have a prefix, and remove it."""
-    names = [name for name in weights if name.startswith(prefix)]
-    return {name.removeprefix(prefix): weights.pop(name) for name in names}
 
 
 def _flat(reach: DataReach) -> dict[str, Array]:

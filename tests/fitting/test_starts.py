@@ -23,7 +23,8 @@ from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.model.model import Model, load
+from lfrtorch.model.loading import load
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

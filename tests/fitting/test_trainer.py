@@ -28,9 +28,11 @@ from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import EXPLOSION, Fit, Progress
 from lfrtorch.least_squares.adam import Adam
-from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, LevenbergMarquardt, Point
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
-from lfrtorch.model.model import Model, load
+from lfrtorch.least_squares.residual import LeastSquares, Point
+from lfrtorch.model.loading import load
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

@@ -1,6 +1,7 @@
 """Fits that stay among models that are proven to contract."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from lfrtorch.fitting.multistart import fit
 from lfrtorch.guarantees.contracting import Contracting, MarginBound
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.bounded_system import BoundedSystem
+from lfrtorch.least_squares.guarantee import guarantee_of
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import CholeskySystem
 from lfrtorch.least_squares.problem import Problem
@@ -96,7 +98,9 @@ def test_every_model_on_the_way_contracts(trainer):
 
 def test_what_has_no_certificate_is_not_admitted():
     model, record = bistable()
-    problem = Problem.of(model, record, guarantee="contracting")
+    problem = Problem.of(
+        model, record, guarantee=partial(guarantee_of, "contracting", record.samples)
+    )
     theta = problem.theta
     assert problem.admissible(theta) is theta
     problem.linearise(theta)
@@ -113,7 +117,7 @@ def test_a_start_without_a_certificate_is_refused():
     with torch.no_grad():
         model.lfr.cell.A.fill_(1.1)
     with pytest.raises(ValueError, match="needs a start that is proven to contract"):
-        Problem.of(model, record, guarantee="contracting")
+        Problem.of(model, record, guarantee=partial(guarantee_of, "contracting", record.samples))
     polynomial = random_model(polynomial_cell(1, 1, 2))
     trainer = LevenbergMarquardt(guarantee="contracting")
     with pytest.raises(ValueError, match=r"needs a network .* not a Polynomial"):
@@ -131,7 +135,9 @@ def test_a_rate_that_is_asked_for_is_kept():
             Contracting(result.model.lfr.cell, 0.4)
         model, record = bistable()
     with pytest.raises(ValueError, match=r"poles within 0\.4"):
-        Problem.of(model, record, guarantee=0.4)  # the start has 0.5
+        Problem.of(
+            model, record, guarantee=partial(guarantee_of, 0.4, record.samples)
+        )  # the start has 0.5
     for wrong in (1.0, -0.5, 1):
         with pytest.raises(ValueError, match=r"guarantee is .* a rate above 0 and below 1"):
             LevenbergMarquardt(guarantee=wrong)

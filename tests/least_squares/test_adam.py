@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from lfrtorch.least_squares.adam import Adam, Differentiable
-from lfrtorch.least_squares.levenberg_marquardt import Point
+from lfrtorch.least_squares.residual import Point
 
 pytestmark = pytest.mark.numeric
 

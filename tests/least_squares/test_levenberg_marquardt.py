@@ -11,7 +11,8 @@ from reference import DenseJacobian, normal
 from torch import Tensor
 from torch.func import jacrev
 
-from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, LevenbergMarquardt, LMState
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
+from lfrtorch.least_squares.residual import LeastSquares
 
 pytestmark = pytest.mark.numeric
 

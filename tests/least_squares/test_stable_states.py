@@ -1,6 +1,7 @@
 """Eigenvalues of A that a search keeps within the unit circle."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -210,7 +211,7 @@ def test_a_start_that_is_not_stable_stays_within_its_own_circle():
     model, record = unstable_data()
     with torch.no_grad():
         model.lfr.cell.A[0, 0] = 1.01
-    problem = Problem.of(model, record, guarantee="stable")
+    problem = Problem.of(model, record, guarantee=partial(guarantee_of, "stable", record.samples))
     theta = problem.theta.clone()
     assert problem.admissible(theta) is theta
     theta[0] = 1.3
@@ -226,4 +227,4 @@ def test_a_guarantee_has_a_name_or_a_rate():
 def test_a_rate_that_is_none_is_refused_before_anything_is_proven(rate: float):
     cell = LFRCell(1, 1, 2, dtype=torch.float64)
     with pytest.raises(ValueError, match="give a rate above 0 and below 1"):
-        guarantee_of(rate, cell, 100)
+        guarantee_of(rate, 100, cell)

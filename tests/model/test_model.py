@@ -27,7 +27,8 @@ from lfrtorch.least_squares.problem import Problem
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.model.model import Model, load
+from lfrtorch.model.loading import load
+from lfrtorch.model.model import Model
 
 pytestmark = pytest.mark.numeric
 

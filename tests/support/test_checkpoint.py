@@ -20,7 +20,8 @@ from lfrtorch._support import checkpoint
 from lfrtorch.data.records import Channel
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
-from lfrtorch.model.model import Model, load
+from lfrtorch.model.loading import load
+from lfrtorch.model.model import Model
 
 U = np.random.default_rng(0).normal(size=(50, 2))
 
