@@ -25,6 +25,7 @@ from lfrtorch import (
 )
 from lfrtorch.engine.initial_state import measured_start
 from lfrtorch.fitting.from_outputs import with_measured_states
+from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.windows import windows
 from lfrtorch.linear.measured_states import measured_states_model
 
@@ -68,9 +69,32 @@ def flights() -> Dataset:
     return Dataset("upright", [one], [two], [three], ahead={"rates": rates})
 
 
+class Said(Observer):
+    """Keeps what is said."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.texts.append(text)
+
+
 @pytest.fixture(scope="module")
-def with_equations(flights: Dataset) -> lfrtorch.Run:
-    return lfrtorch.identify(flights, Settings(known=known(), nx=0, nn=0, horizon=HORIZON))
+def said() -> Said:
+    return Said()
+
+
+@pytest.fixture(scope="module")
+def with_equations(flights: Dataset, said: Said) -> lfrtorch.Run:
+    settings = Settings(known=known(), nx=0, nn=0, horizon=HORIZON)
+    return lfrtorch.identify(flights, settings, observer=said)
+
+
+def test_windows_are_a_tenth_and_then_three_of_the_horizon(
+    with_equations: lfrtorch.Run, said: Said
+) -> None:
+    found = [text.split(" samples")[0] for text in said.texts if text.startswith("windows of")]
+    assert found == ["windows of 2", "windows of 8"]
 
 
 def test_an_unstable_known_system_is_found(with_equations: lfrtorch.Run, flights: Dataset) -> None:

@@ -79,6 +79,16 @@ def test_a_fit_keeps_what_is_given_and_is_as_good(tmp_path: Path):
     assert {*again.lfr.cell.held} == {*PHYSICAL}
 
 
+def test_entries_are_given_in_physical_units():
+    model = random_model(random_cell(2, 2, 2, 1, 1, 3))
+    u, y = model.scaler.u_scale, model.scaler.y_scale[:, None]
+    Dzu, Dyu, Dyw = [[0.3, 0.4]], [[0.5, 0.6], [0.7, 0.8]], [[0.9], [1.1]]
+    given: dict[str, Any] = {"Dzu": Dzu, "Dyu": Dyu, "Dyw": Dyw}
+    cell = with_given(model, given)[0].lfr.cell
+    for found, wanted in ((cell.Dzu, Dzu * u), (cell.Dyu, Dyu * u / y), (cell.Dyw, Dyw / y)):
+        np.testing.assert_allclose(found.detach(), wanted, rtol=1e-12)
+
+
 def test_it_is_fitted_again_and_in_windows():
     train = oscillator()
     options: dict[str, Any] = {"nx": 2, "nz": 1, "nw": 1, "nn": 4, "starts": 2, "fixed": PHYSICAL}

@@ -70,6 +70,18 @@ def test_signals_are_the_same_in_other_states():
             torch.testing.assert_close(getattr(now.signals(data), name), signal)
 
 
+@pytest.mark.parametrize(("name", "value", "scaled"), [("Cz", 0.0, True), ("Bw", 0.7, False)])
+def test_states_scale_if_no_held_entry_moves(name: str, value: float, scaled: bool):
+    model = far_off()
+    model.lfr.cell.hold({name: (torch.tensor(True), torch.tensor(value, dtype=torch.float64))})
+    record = measure(model, 200)
+    scale_states(model, record)
+    assert (model.lfr.cell.get_parameter(name) == value).all()
+    rms = np.sqrt(np.diag(model.state_covariance))
+    assert (np.abs(rms - 1.0).max() < 1e-9) == scaled
+    np.testing.assert_allclose(model.simulate(record), record.y, rtol=1e-9, atol=1e-9)
+
+
 def test_states_of_unit_rms_keep_their_bits():
     model = far_off()
     record = measure(model, 100)
