@@ -242,8 +242,9 @@ def test_parts_of_a_file_begin_at_their_own_outputs(tmp_path) -> None:
     ],
 )
 def test_what_cannot_be_is_refused(flights: Dataset, settings: dict[str, Any], message: str):
+    short = Dataset("short", [flights.train[0][:200]], [], [])
     with pytest.raises(InputError, match=message):
-        lfrtorch.identify(flights, Settings(**settings, horizon=HORIZON))
+        lfrtorch.identify(short, Settings(**settings, horizon=HORIZON))
 
 
 def test_outputs_that_are_fitted_tell_no_states(flights: Dataset) -> None:

@@ -92,6 +92,7 @@ def test_entries_are_given_in_physical_units():
 def test_it_is_fitted_again_and_in_windows():
     train = oscillator()
     options: dict[str, Any] = {"nx": 2, "nz": 1, "nw": 1, "nn": 4, "starts": 2, "fixed": PHYSICAL}
+    options["trainer"] = lfrtorch.LevenbergMarquardt(max_iter=25)
     dataset = Dataset("oscillator", [train], [oscillator(seed=2)], [])
     for more in ({"refit": True}, {"horizon": 100}):
         run = lfrtorch.identify(dataset, Settings(**{**options, **more}))
