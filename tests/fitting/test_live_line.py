@@ -11,7 +11,7 @@ import pytest
 
 import lfrtorch
 from lfrtorch.data.records import Channel, Record
-from lfrtorch.fitting.live_line import ProgressLine, StartsLine, _progress_text
+from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.observer import LineObserver
 from lfrtorch.fitting.trainer import Progress, RestartSummary, Round
 
@@ -57,14 +57,24 @@ def step(iteration: int, **report: float) -> Progress:
     return Progress(iteration, 40, 1.5e-3, 2.5e-3, 2.0 * iteration, iteration == 4, report, 1.0)
 
 
-def test_text_names_every_number():
-    text = _progress_text(step(4, damping=0.125, gain_ratio=0.75, rank=9), "m")
+def written(bla: lfrtorch.LinearModel, *steps: Progress) -> list[str]:
+    """The lines of these iterations in a file."""
+    (model,), stream = models(bla, 1), io.StringIO()
+    line = ProgressLine(every=1, stream=stream)
+    for each in steps:
+        line(model, each)
+    line.close()
+    return stream.getvalue().splitlines()
+
+
+def test_text_names_every_number(bla: lfrtorch.LinearModel):
+    whole = step(4, damping=0.125, gain_ratio=0.75, rank=9)
+    begin, text, worse = written(bla, step(0), whole, replace(step(5), validation=4e-3))
     assert text == (
         " 4/40  train 1.500 mm  validation 2.500 mm*  72 s left  damping 0.12  gain 0.75"
     )
-    assert "left" not in _progress_text(step(0), "m")
-    worse = replace(step(5), validation=4e-3)
-    assert "validation 4.000 mm (best 2.500 mm)  " in _progress_text(worse, "m", step(4))
+    assert "left" not in begin
+    assert "validation 4.000 mm (best 2.500 mm)  " in worse
 
 
 def test_a_file_gets_a_line_now_and_then_and_the_last(bla: lfrtorch.LinearModel):
@@ -91,7 +101,7 @@ def test_a_terminal_gets_one_live_line_that_fits(
     line(model, step(4))
     line.close()
     line.close()
-    whole = _progress_text(step(4), "m")
+    (whole,) = written(bla, step(4))
     (seen, after) = stream.screen()
     assert whole.startswith(seen)
     assert len(seen) < width
