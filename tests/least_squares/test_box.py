@@ -104,14 +104,14 @@ def test_a_step_beyond_ends_there_and_is_the_best_of_those(theta, free, ends: di
 
 def test_a_guarantee_is_made_if_something_could_break_it():
     plain, bounded = random_cell(1, 1, 2), bounded_cell()
-    assert guarantee_of(None, plain, 100) is None
-    assert isinstance(guarantee_of(None, bounded, 100), Box)
-    assert isinstance(guarantee_of("stable", plain, 100), Stable)
-    assert isinstance(guarantee_of("stable", bounded, 100), Stable)
+    assert guarantee_of(None, 100, plain) is None
+    assert isinstance(guarantee_of(None, 100, bounded), Box)
+    assert isinstance(guarantee_of("stable", 100, plain), Stable)
+    assert isinstance(guarantee_of("stable", 100, bounded), Stable)
     plain.hold({"A": (torch.eye(2).bool(), torch.tensor(0.1))})
-    assert isinstance(guarantee_of("stable", plain, 100), Stable)
+    assert isinstance(guarantee_of("stable", 100, plain), Stable)
     plain.hold({"A": (torch.tensor(True), plain.A.detach())})
-    assert guarantee_of("stable", plain, 100) is None
+    assert guarantee_of("stable", 100, plain) is None
     frozen = random_cell(1, 1, 2)
     frozen.A.requires_grad_(False)
-    assert guarantee_of("stable", frozen, 100) is None
+    assert guarantee_of("stable", 100, frozen) is None
