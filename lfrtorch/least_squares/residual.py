@@ -36,7 +36,7 @@ class Point(NamedTuple):
         theta: θ (P,).
         residual: r (M,).
         cost: |r|².
-        seen: what else the problem needs for derivatives there, as trajectories: tuples of tensors.
+        seen: further values for derivatives there, as trajectories: tuples of tensors.
     """
 
     theta: Tensor

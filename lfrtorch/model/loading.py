@@ -39,7 +39,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
 
 
 def _maker(folder: str | Path, static: Module | None, own: Any) -> MapMaker:
-    """What makes the map of a description, or the user's."""
+    """Maker of the map of a description, or the user's map."""
     if not static and (name := foreign(own)):
         raise InputError(
             f"'{folder}' holds a static nonlinearity of class {name}, which is not part of this "
