@@ -290,6 +290,8 @@ def evidence(
     if noise is None and noise_rms is not None:
         noise = np.full(len(scale), noise_rms)
     linear, nonlinear = explained_parts(train)
+    if any(response.record.start == "measured" for response in train):
+        linear = None  # its states are the outputs, and can be no others
     here, there = ([r.linear_error / scale for r in part] for part in (train, validation))
     risen, fell = after_kept(result)
     peak = _peak(train, result.model.scaler.u_offset)

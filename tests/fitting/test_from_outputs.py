@@ -167,6 +167,16 @@ def test_sizes_without_a_horizon_are_judged_by_simulations_from_an_output() -> N
     assert run.choice.chosen.ratio < 0.1
 
 
+def test_no_other_states_than_the_outputs_are_advised() -> None:
+    """A hidden state is missing, and nx can be nothing but the number of outputs."""
+    u = np.random.default_rng(5).standard_normal(600)
+    y = lfilter([0.0, 1.0], [1.0, -1.5, 0.7], u)
+    record = Record(u, y, start="measured")
+    run = lfrtorch.identify(record, Settings(nx=1, nz=1, nw=1, nn=2, horizon=10, starts=1))
+    assert run.advice
+    assert not any("nx" in (each.change or {}) for each in run.advice)
+
+
 def test_samples_that_are_not_valid_tell_no_linear_model(flights: Dataset) -> None:
     (one,) = flights.train
     valid = np.ones(one.y.shape, dtype=bool)
