@@ -112,15 +112,9 @@ def search_from(problem: Problem, matrices: Matrices) -> Search:
 
 
 def transformation(problem: Problem, matrices: Matrices) -> tuple[Array, Array]:
-    """Return T and T⁻¹ to balanced coordinates with states of unit deviation.
-
-    Rounding decides the signs of balanced states, and the signs decide what a random start of an
-    NL-LFR sees of them. So each state acts with a positive sign on the output that it moves most.
-    """
+    """Return T and T⁻¹ to balanced coordinates with states of unit deviation."""
     A, B, C, D = matrices
     T, inverse = balancing(A, B, C)
     std = problem.state_deviation((T @ A @ inverse, T @ B, C @ inverse, D))
-    of_x = C @ inverse
-    most = of_x[np.abs(of_x).argmax(axis=0), np.arange(len(A))]
-    scale = np.where(std > 0, std, 1.0) * np.where(most < 0, -1.0, 1.0)
-    return T / scale[:, None], inverse * scale
+    std = np.where(std > 0, std, 1.0)
+    return T / std[:, None], inverse * std
