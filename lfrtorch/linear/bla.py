@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -195,19 +195,31 @@ def refined_near(model: LinearModel, records: Sequence[Record]) -> LinearModel:
     # and another one that does not fade stays as it is.
     data = [without_coordinates(record) for record in records]
     offset = bool(model.y_offset.any() or model.u_offset.any())
-    feedthrough = bool(model.D.any())
     if model.poles.size and np.abs(model.poles).max() >= 1.0:
         integrate = _integrating_outputs(model)
         if not any(integrate):
             return model
+        feedthrough = bool(model.D.any())
         return estimate_bla(
             data, model.nx, offset=offset, feedthrough=feedthrough, integrators=integrate
         )
-    posed = _of_signals(data, offset=offset, prediction=False, feedthrough=feedthrough)
-    problem = posed.problem
-    _, matrices = problem.with_input_matrices(model.A, model.C / posed.scaler.y_scale[:, None])
-    near = posed.model(problem.refined(search_from(problem, matrices).advance(_NEAR, _SETTLED)))
-    return replace(near, state_covariance=state_moment(near.to_model(), data).numpy())
+    scaler = Scaler.of(data, offset=offset)
+    problem = SignalFit(
+        [scaler.normalise(record) for record in data],
+        offset=offset,
+        prediction=False,
+        feedthrough=bool(model.D.any()),
+    )
+    _, matrices = problem.with_input_matrices(model.A, model.C / scaler.y_scale[:, None])
+    search = search_from(problem, matrices).advance(_NEAR, _SETTLED)
+    found = problem.refined(search)
+    near = physical(found, scaler, data[0])
+    near = near.transformed(*transformation(problem, found.matrices))
+    if found.constant is not None:
+        near = replace(near, y_offset=near.y_offset + scaler.y_scale * found.constant)
+    fit = LinearFit("simulation", found.rmse, found.iterations, found.reason, 0.0)
+    moment = state_moment(near.to_model(), data).numpy()
+    return replace(near, state_covariance=moment, fit=fit)
 
 
 def _integrating_outputs(model: LinearModel) -> list[int]:
@@ -235,7 +247,7 @@ class Settings(NamedTuple):
     max_iter: int
 
 
-class Posed(NamedTuple):
+class _Posed(NamedTuple):
     """Least-squares problem in normalised units, and the data that it stands for."""
 
     problem: Problem
@@ -244,33 +256,8 @@ class Posed(NamedTuple):
     records: list[Record]
     notes: list[str]
 
-    def model(self, found: Refined) -> LinearModel:
-        """Return what was found, in physical units and balanced coordinates."""
-        scaler, about = self.scaler, self.about
-        by_u, by_y, S = 1.0 / scaler.u_scale, scaler.y_scale[:, None], found.innovation_covariance
-        nx = len(found.A)
-        sizes = [np.ones((nx, nx)), np.tile(by_u, (nx, 1)), np.tile(by_y, (1, nx)), by_y * by_u]
-        size = np.concatenate([part.ravel() for part in sizes])
-        model = LinearModel(
-            *(part * matrix for part, matrix in zip(sizes, found.matrices, strict=True)),
-            fs=about.fs,
-            u_offset=scaler.u_offset,
-            y_offset=scaler.y_offset + scaler.y_scale * found.constant,
-            inputs=about.inputs,
-            outputs=about.outputs,
-            K=None if found.K is None else found.K / scaler.y_scale,
-            innovation_covariance=None if S is None else by_y * S * scaler.y_scale,
-            covariance=None
-            if found.covariance is None
-            else size[:, None] * found.covariance * size,
-            fit=LinearFit("simulation", found.rmse, found.iterations, found.reason, 0.0),
-        )
-        if np.abs(model.poles).max() >= 1.0:  # states without a controller have no deviation
-            return model
-        return model.transformed(*transformation(self.problem, found.matrices))
 
-
-def pose(data: list[Record] | FRF, settings: Settings, direct: int = 0) -> Posed:
+def pose(data: list[Record] | FRF, settings: Settings, direct: int = 0) -> _Posed:
     """Pose the problem of a criterion: on spectra where that is the same as on signals.
 
     The last ``direct`` inputs act on the output alone; of a response they are differences of its
@@ -289,15 +276,21 @@ def pose(data: list[Record] | FRF, settings: Settings, direct: int = 0) -> Posed
         notes = [*about.notes, *more]
     else:
         prediction = refine == "prediction"
-        records = records if prediction else steady_state(records) or records
-        posed = _of_signals(
-            records, offset=offset, prediction=prediction, feedthrough=feedthrough, direct=direct
-        )
-        about, scaler, notes = records[0], posed.scaler, []
+        if not prediction:
+            records = steady_state(records) or records
+        about, notes = records[0], []
+        scaler = Scaler.of(records, offset=offset)
         normalised = [scaler.normalise(record) for record in records]
         spectra = None if prediction else spectral_data_of_records(normalised, offset=offset)
         if spectra is None:
-            return posed
+            problem = SignalFit(
+                normalised,
+                offset=offset,
+                prediction=prediction,
+                feedthrough=feedthrough,
+                direct=direct,
+            )
+            return _Posed(problem, scaler, about, records, notes)
         problem = ResponseFit(spectra, known=False, feedthrough=feedthrough)
     if spectra.left_out:
         f = np.abs(np.angle(spectra.z)) * about.fs / (2 * np.pi)
@@ -306,14 +299,7 @@ def pose(data: list[Record] | FRF, settings: Settings, direct: int = 0) -> Posed
             f"{f.max():.4g} Hz; {spectra.left_out} lines with noise, hum or distortion at the "
             "input are left out."
         )
-    return Posed(problem, scaler, about, records, notes)
-
-
-def _of_signals(records: list[Record], *, offset: bool, **settings: Any) -> Posed:
-    """Pose the problem of a simulation or a prediction error of signals."""
-    scaler = Scaler.of(records, offset=offset)
-    normalised = [scaler.normalise(record) for record in records]
-    return Posed(SignalFit(normalised, offset=offset, **settings), scaler, records[0], records, [])
+    return _Posed(problem, scaler, about, records, notes)
 
 
 def _stable(
@@ -325,8 +311,7 @@ def _stable(
 ) -> LinearModel:
     """Fit a model with all poles inside the unit circle; A and C of ``near`` are a start, too."""
     refine, weight, offset, _, max_iter = settings
-    posed = pose(data, settings, direct)
-    problem, scaler, _, records, notes = posed
+    problem, scaler, about, records, notes = pose(data, settings, direct)
     if isinstance(problem, ResponseFit):
         check_spectral_data(problem.data, nx, direct)
     else:
@@ -337,7 +322,7 @@ def _stable(
     if near is not None:
         values = np.array(_fit(near).singular_values)
         given = [SubspaceEstimate(near.A, near.C / scaler.y_scale[:, None], values, None)]
-    tried = candidates(problem, nx, [*problem.subspace_estimates(nx), *given])
+    tried = candidates(problem, nx, given)
     estimate, found = best_minimum(problem, tried, max_iter)
     if isinstance(problem, SignalFit):
         found = problem.unstable(found, max_iter)
@@ -354,21 +339,23 @@ def _stable(
             f"the search was stopped after {max_iter} iterations: "
             f"use estimate_bla(max_iter={2 * max_iter})."
         )
-    model, rmse = posed.model(found), found.rmse
+    model = physical(found, scaler, about)
+    if np.abs(model.poles).max() < 1.0:  # states without a controller have no deviation
+        model = model.transformed(*transformation(problem, found.matrices))
+    rmse = found.rmse
+    if found.constant is not None:
+        model = replace(model, y_offset=model.y_offset + scaler.y_scale * found.constant)
     if records and refine != "prediction":
         errors = np.concatenate([r.errors(model.simulate(r)) for r in records])
-        if offset and isinstance(problem, ResponseFit):  # the fit to spectra has eliminated it
+        if offset and found.constant is None:  # the fit to spectra has eliminated it
             model = replace(model, y_offset=model.y_offset + errors.mean(axis=0))
             errors = errors - errors.mean(axis=0)
         if refine == "simulation":
             rmse = float(rms((errors / scaler.y_scale)[scored(records)]))
-    fit = replace(
-        _fit(model),
-        criterion=refine,
-        rmse=rmse,
-        singular_values=tuple(map(float, estimate.singular_values)),
-        notes=tuple(notes),
-    )
+    fit = LinearFit(
+        refine, rmse, found.iterations, found.reason, 0.0,
+        tuple(map(float, estimate.singular_values)), tuple(notes),
+    )  # fmt: skip
     return replace(model, fit=fit)
 
 
@@ -493,3 +480,23 @@ def _doubts(problem: Problem, estimate: SubspaceEstimate, found: Refined) -> lis
             "one, or an order above what they carry; look at the data, or lower nx."
         )
     return notes
+
+
+def physical(found: Refined, scaler: Scaler, about: FRF | Record) -> LinearModel:
+    """Return the model in physical units, with its covariance."""
+    nx = len(found.A)
+    by_u, by_y = 1.0 / scaler.u_scale, scaler.y_scale[:, None]
+    sizes = [np.ones((nx, nx)), np.tile(by_u, (nx, 1)), np.tile(by_y, (1, nx)), by_y * by_u]
+    size = np.concatenate([part.ravel() for part in sizes])
+    S = found.innovation_covariance
+    return LinearModel(
+        *(part * matrix for part, matrix in zip(sizes, found.matrices, strict=True)),
+        fs=about.fs,
+        u_offset=scaler.u_offset,
+        y_offset=scaler.y_offset,
+        inputs=about.inputs,
+        outputs=about.outputs,
+        K=None if found.K is None else found.K / scaler.y_scale,
+        innovation_covariance=None if S is None else by_y * S * scaler.y_scale,
+        covariance=None if found.covariance is None else size[:, None] * found.covariance * size,
+    )

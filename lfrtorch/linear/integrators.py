@@ -30,9 +30,11 @@ from jaxtyping import Bool
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Booleans
 from lfrtorch.data.metrics import rms
-from lfrtorch.data.records import Channel, Record, Scaler, interpolated
+from lfrtorch.data.records import Channel, NormalisedRecord, Record, Scaler, interpolated
+from lfrtorch.engine.lfr import LFR
 from lfrtorch.linear.frf import FRF
-from lfrtorch.linear.model import LinearFit, LinearModel
+from lfrtorch.linear.model import LinearFit, LinearModel, linear_cell
+from lfrtorch.model.model import simulate_record
 
 _SAME_LINE = 1e-9
 """Distance from z = 1 below which a line is the one at 0, where the response is infinite."""
@@ -300,8 +302,11 @@ def placed(
         errors = np.concatenate([simulation_errors(model, r) for r in at_rest])
         error = errors.sum(axis=0) / scored(at_rest).sum(axis=0)
         model = replace(model, y_offset=model.y_offset + error)
-    signals = model.to_model().signals
-    states = [signals(replace(r, skip=0)).x[0, :-1].numpy() for r in records]
+    lfr = LFR(linear_cell(model.A, model.B, model.C, model.D))
+    states = []
+    for r in records:
+        about = NormalisedRecord(r.u - model.u_offset, r.y - model.y_offset, replace(r, skip=0))
+        states.append(simulate_record(lfr, about, r.start).x[0, :-1].numpy())
     std = np.concatenate(states).std(axis=0)
     std = np.where(std > 0, std, 1.0)
     model = model.transformed(np.diag(1.0 / std), np.diag(std))

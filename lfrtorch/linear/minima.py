@@ -42,19 +42,24 @@ class Candidate(NamedTuple):
     matrices: Matrices
 
 
-def candidates(problem: Problem, nx: int, estimates: Sequence[SubspaceEstimate]) -> list[Candidate]:
-    """Return the candidates of finite cost, the best one first."""
+def candidates(problem: Problem, nx: int, more: Sequence[SubspaceEstimate] = ()) -> list[Candidate]:
+    """Return the candidates of finite cost, and more of them, the best one first."""
     found = []
-    for estimate in estimates:
+    for estimate in (*problem.subspace_estimates(nx), *more):
         cost, matrices = problem.with_input_matrices(estimate.A, estimate.C)
         if np.isfinite(cost):
             found.append(Candidate(cost, estimate, matrices))
     if not found:
-        raise InputError(
-            f"no stable linear model of order {nx} could be started from these data; "
-            "try a lower nx or a longer record."
-        )
+        raise no_start(nx)
     return sorted(found, key=lambda each: each.cost)
+
+
+def no_start(nx: int) -> InputError:
+    """Say that no candidate has a finite cost."""
+    return InputError(
+        f"no stable linear model of order {nx} could be started from these data; "
+        "try a lower nx or a longer record."
+    )
 
 
 def best_minimum(

@@ -18,6 +18,7 @@ from jaxtyping import Complex128, Float
 from torch import Tensor
 
 from lfrtorch._support.types import Array, Booleans, Complex
+from lfrtorch.linear.pole_limits import Excess
 from lfrtorch.linear.spectral_data import SpectralData
 
 
@@ -54,37 +55,73 @@ class Modes(NamedTuple):
         return _gains(1.0 / (z[:, None] - self.poles), products) + self.D
 
 
-class ModalColumns:
-    """Derivative of the errors √weight (G U - Y) with A, B, C, D, by modes."""
+class ModalJacobian:
+    """Jacobian of the errors √weight (G U - Y), and of the excess of poles, with A, B, C, D."""
 
-    def __init__(self, modes: Modes, data: SpectralData, free: Booleans) -> None:
-        self._modes, self._data, self._free = modes, data, free
+    def __init__(
+        self,
+        modes: Modes,
+        data: SpectralData,
+        errors: Complex128[Complex, "F ny m"],
+        *,
+        free: Booleans,
+        excess: tuple[Float[Array, " nx"], Float[Array, "nx P"]],
+    ) -> None:
+        self._modes, self._data, self._errors = modes, data, errors
         r = 1.0 / (data.z[:, None] - modes.poles)
         self._functions = np.hstack([r * r, r])
         self._change = _change(modes, free)
+        self._free = free
+        self._gradient_of_errors = self._gradient(errors)
+        size = float(np.linalg.norm(errors))
+        self._excess = Excess(*excess, size, self._gradient_of_errors)
 
-    def system(self, truncation: float, more: Float[Array, "n P"] | None = None) -> _GramSystem:
-        """The system of these columns, and of more rows."""
-        del truncation
+    def system(self, damping: float, truncation: float) -> tuple[_GramSystem, Tensor]:
+        """Return the system and the gradient, see ``levenberg_marquardt.Jacobian``."""
+        del damping, truncation
         Q = np.linalg.qr(_without_scaling(self._modes, self._change).T)[0]
         Z = self._change @ Q
         G = (Z.conj().T @ (self._products() @ Z)).real
-        return _GramSystem(G if more is None else G + (more @ Q).T @ (more @ Q), Q)
+        gradient = self._gradient_of_errors
+        if self._excess.active:
+            T = self._excess.jacobian
+            TQ = T @ Q
+            G = G + TQ.T @ TQ
+            gradient = gradient + T.T @ self._excess.residual
+        return _GramSystem(G, Q), torch.as_tensor(gradient)
 
     def tangent(self, d_theta: Tensor) -> Tensor:
-        """J d_theta."""
+        """J dθ."""
+        d = d_theta.numpy()
+        response = self._data.weighted(self._tangent(self._change @ d) @ self._data.U)
+        return stacked(response, self._excess.jacobian @ d)
+
+    def adjoint(self, residual: Tensor) -> Tensor:
+        """Jᵀ residual (P,)."""
+        nx = len(self._modes.poles)
+        real, imaginary = residual[:-nx].numpy().reshape(2, *self._errors.shape)
+        of_errors = self._gradient(real + 1j * imaginary)
+        return torch.as_tensor(of_errors + self._excess.jacobian.T @ residual[-nx:].numpy())
+
+    def _products(self) -> Complex:
+        """JᴴJ with λ, b, c and the free entries of D, (Kc, Kc)."""
+        functions = _with_one(self._functions)
+        left, right = _constants(self._modes, self._data.U.shape[1])
+        free = np.concatenate([np.ones(left.shape[1] - self._free.size, bool), self._free.ravel()])
+        return _products(functions, self._data, left[:, free], right[:, free])
+
+    def _tangent(self, change: Complex) -> Complex:
+        """Return the change of G (F, ny, nu) with a change of λ, b, c and D."""
         m = self._modes
-        d_poles, db, dc, dD = self._parts(self._change @ d_theta.numpy())
+        d_poles, db, dc, dD = self._parts(change)
         squares = d_poles[:, None, None] * (m.c.T[:, :, None] * m.b[:, None, :])
         singles = m.c.T[:, :, None] * db[:, None, :] + dc[:, :, None] * m.b[:, None, :]
-        response = _gains(self._functions, np.concatenate([squares, singles])) + dD
-        return stacked(self._data.weighted(response @ self._data.U))
+        return _gains(self._functions, np.concatenate([squares, singles])) + dD
 
-    def gradient(self, r: Tensor) -> Tensor:
-        """Jᵀ r (P,)."""
+    def _gradient(self, r: Complex) -> Array:
+        """Jᵀ r (P,) of errors (F, ny, m)."""
         m, n = self._modes, len(self._modes.poles)
-        real, imaginary = r.numpy().reshape(2, *self._data.Y.shape)
-        H = self._data.weighted(real + 1j * imaginary) @ self._data.U.conj().swapaxes(1, 2)
+        H = self._data.weighted(r) @ self._data.U.conj().swapaxes(1, 2)
         sums = self._functions.conj().T @ H.reshape(len(H), -1)
         squares, singles = sums.reshape(2, n, len(m.c), -1)
         c, b = m.c.T.conj(), m.b.conj()
@@ -96,14 +133,7 @@ class ModalColumns:
                 H.sum(axis=0)[self._free],
             ]
         )
-        return torch.as_tensor((self._change.conj().T @ g).real)
-
-    def _products(self) -> Complex:
-        """JᴴJ with λ, b, c and the free entries of D, (Kc, Kc)."""
-        functions = _with_one(self._functions)
-        left, right = _constants(self._modes, self._data.U.shape[1])
-        free = np.concatenate([np.ones(left.shape[1] - self._free.size, bool), self._free.ravel()])
-        return _products(functions, self._data, left[:, free], right[:, free])
+        return (self._change.conj().T @ g).real
 
     def _parts(self, change: Complex) -> tuple[Complex, Complex, Complex, Complex]:
         (ny, n), nu = self._modes.c.shape, self._data.U.shape[1]
@@ -221,16 +251,24 @@ def _change(m: Modes, free: Booleans) -> Complex:
     np.fill_diagonal(apart, 1.0)
     near = (1.0 - np.eye(n)) / apart  # 1 / (λⱼ - λᵢ)
     Vt = m.V.T
+    sizes = n * n, n * nu, ny * n, ny * nu
     of_poles = (m.W[:, :, None] * Vt[:, None, :]).reshape(n, -1)
     mixed = -np.einsum("qj,jk,ij->ikq", m.V, m.b, near, optimize=True)
     b_A = (m.W[:, None, :, None] * mixed[:, :, None, :]).reshape(n * nu, -1)
     mixed = np.einsum("oj,jp,ji->iop", m.c, m.W, near, optimize=True)
     c_A = (mixed[:, :, :, None] * Vt[:, None, None, :]).reshape(n * ny, -1)
+    b_B = np.einsum("ip,jk->ijpk", m.W, np.eye(nu)).reshape(n * nu, -1)
     c_C = np.einsum("iq,ou->iouq", Vt, np.eye(ny)).reshape(n * ny, -1)
-    of_D = np.eye(ny * nu)[free.ravel()]
-    others = scipy.linalg.block_diag(np.zeros((n, 0)), np.kron(m.W, np.eye(nu)), c_C, of_D)
-    of_A = np.concatenate([of_poles, b_A, c_A, np.zeros((len(of_D), n * n))])
-    return np.hstack([of_A, others], dtype=np.complex128)
+    change = np.zeros((n * (1 + nu + ny) + int(free.sum()), sum(sizes)), dtype=complex)
+    rows = np.cumsum([0, n, n * nu, n * ny])
+    columns = np.cumsum([0, *sizes])
+    change[: rows[1], : columns[1]] = of_poles
+    change[rows[1] : rows[2], : columns[1]] = b_A
+    change[rows[2] : rows[3], : columns[1]] = c_A
+    change[rows[1] : rows[2], columns[1] : columns[2]] = b_B
+    change[rows[2] : rows[3], columns[2] : columns[3]] = c_C
+    change[rows[3] + np.arange(int(free.sum())), columns[3] + np.flatnonzero(free)] = 1.0
+    return change
 
 
 def _without_scaling(m: Modes, change: Complex) -> Float[Array, "K P"]:
@@ -252,6 +290,7 @@ def _without_scaling(m: Modes, change: Complex) -> Float[Array, "K P"]:
     return np.concatenate([*parts, D.real])
 
 
-def stacked(errors: Complex, *more: Array) -> Tensor:
-    """Real parts, then imaginary parts, then more, in one row."""
-    return torch.as_tensor(np.concatenate([errors.real, errors.imag, *more], axis=None))
+def stacked(errors: Complex, more: Array) -> Tensor:
+    """Real parts, then imaginary parts, then more."""
+    flat = errors.ravel()
+    return torch.as_tensor(np.concatenate([flat.real, flat.imag, more]))

@@ -16,23 +16,22 @@ from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
-import scipy
 
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
 from lfrtorch.data.metrics import rms
 from lfrtorch.data.records import Record, Scaler
 from lfrtorch.least_squares.search import Search
-from lfrtorch.linear.bla import Posed, Settings, default_criterion, pose
+from lfrtorch.linear.bla import Settings, default_criterion, physical, pose
 from lfrtorch.linear.frf import FRF
-from lfrtorch.linear.minima import ALIKE, candidates, distinct, search_from
-from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.minima import ALIKE, distinct, no_start, search_from, transformation
+from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.refinement import Matrices, Refined
 from lfrtorch.linear.requirements import check_spectral_data
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
 from lfrtorch.linear.spectral_data import spectral_data_of_parts
-from lfrtorch.linear.subspace import Subspace, SubspaceEstimate, spectral_subspaces
+from lfrtorch.linear.subspace import SpectralSubspace, spectral_subspaces
 
 Window = tuple[int, int]
 """First sample, and the one after the last."""
@@ -72,21 +71,27 @@ class OrderFits:
 
     def __init__(
         self,
-        posed: Posed,
+        problem: ResponseFit,
+        scaler: Scaler,
+        about: FRF | Record,
         train: Sequence[tuple[Record, Sequence[Window]]],
         *,
         offset: bool,
         most: int,
         max_iter: int,
     ) -> None:
-        assert isinstance(posed.problem, ResponseFit)
-        self.problem, self._posed, self._train = posed.problem, posed, train
-        self._offset, self._most, self._max_iter = offset, most, max_iter
-        self._subspaces: dict[int, list[Subspace]] = {}
+        self.problem, self._scaler, self._about = problem, scaler, about
+        self._train, self._offset, self._max_iter = train, offset, max_iter
+        inputs = problem.data.U.shape[1] - problem.starts
+        self._driven = ResponseFit(
+            replace(problem.data, U=problem.data.U[:, :inputs]), known=problem.known
+        )
+        self._most = most
+        self._subspaces: dict[int, list[SpectralSubspace]] = {}
         self._found: dict[int, Matrices] = {}
-        self._y_offset = posed.scaler.y_offset
+        self._y_offset = scaler.y_offset
 
-    def _subspaces_for(self, nx: int) -> list[Subspace]:
+    def _subspaces_for(self, nx: int) -> list[SpectralSubspace]:
         """Return subspaces that hold the order: small ones as long as it is low."""
         most = 12
         while most < nx:
@@ -109,13 +114,15 @@ class OrderFits:
         settings = Settings(
             given.get("refine", default), given.get("weight"), offset, through, most_steps
         )
-        posed = pose(data, settings)
+        problem, scaler, about, records, _ = pose(data, settings)
         common: dict[str, Any] = {"offset": offset, "most": most, "max_iter": most_steps}
-        if isinstance(posed.problem, SignalFit):
-            windows = [[(record.skip, record.samples)] for record in posed.records]
-            return cls.of_windows(posed.records, windows, **common, feedthrough=through)
-        whole = [(record, [(0, record.samples)]) for record in posed.records]
-        return cls(posed, whole if settings.refine == "simulation" else (), **common)
+        if isinstance(problem, SignalFit):
+            windows = [[(record.skip, record.samples)] for record in records]
+            return cls.of_windows(records, windows, **common, feedthrough=through)
+        whole = [(record, [(0, record.samples)]) for record in records]
+        return cls(
+            problem, scaler, about, whole if settings.refine == "simulation" else (), **common
+        )
 
     @classmethod
     def of_windows(
@@ -145,9 +152,9 @@ class OrderFits:
             [parts[i] for i in kept], [weights[i] for i in kept], offset=offset
         )
         problem = ResponseFit(spectra, known=False, feedthrough=feedthrough, starts=len(kept))
-        posed = Posed(problem, scaler, records[0], list(records), [])
         whole = list(zip(records, windows, strict=True))
-        return cls(posed, whole, offset=offset, most=most, max_iter=max_iter)
+        common: dict[str, Any] = {"offset": offset, "most": most, "max_iter": max_iter}
+        return cls(problem, scaler, records[0], whole, **common)
 
     @spread_by_hand()
     def fit(self, nx: int) -> tuple[LinearModel, float]:
@@ -181,7 +188,7 @@ class OrderFits:
         """Fit from a model; return the errors over each whole record, too."""
         clock = time.perf_counter()
         check_spectral_data(self.problem.data, model.nx)
-        C = model.C / self._posed.scaler.y_scale[:, None]
+        C = model.C / self._scaler.y_scale[:, None]
         search = search_from(self.problem, self.problem.with_input_matrices(model.A, C)[1])
         found = [self.problem.refined(search)]
         self._advance(search, 12)  # it is near the minimum
@@ -200,25 +207,29 @@ class OrderFits:
 
     def _starts(self, nx: int) -> list[Matrices]:
         """Return starts of finite cost, the best first; of those that are alike one."""
-        found = [
-            extended
+        pairs = [
+            pair
             for below in (nx - 2, nx - 1)
             if below in self._found
-            for extended in self._extended(self._found[below], nx - below)
+            for pair in self._extended(self._found[below], nx - below)
         ]
-        of_data = (subspace.estimate(nx) for subspace in self._subspaces_for(nx))
-        found += [each for each in of_data if each is not None and len(each.A) == nx]
-        ranked = candidates(self.problem, nx, found)
-        apart = distinct([each.cost for each in ranked], ALIKE) or range(len(ranked))
-        return [ranked[i].matrices for i in apart][:4]
+        estimates = [subspace.estimate(nx) for subspace in self._subspaces_for(nx)]
+        pairs += [(e.A, e.C) for e in estimates if e is not None and len(e.A) == nx]
+        found = [self.problem.with_input_matrices(A, C) for A, C in pairs]
+        ranked = sorted((each for each in found if np.isfinite(each[0])), key=lambda each: each[0])
+        if not ranked:
+            raise no_start(nx)
+        apart = distinct([cost for cost, _ in ranked], ALIKE) or range(len(ranked))
+        return [ranked[i][1] for i in apart][:4]
 
-    def _extended(self, below: Matrices, more: int) -> list[SubspaceEstimate]:
+    def _extended(self, below: Matrices, more: int) -> list[tuple[Array, Array]]:
         """Return A and C of a model with ``more`` states that describe its errors."""
         errors = self.problem.equal_noise(self.problem.errors(below))
         estimates = [each.estimate(more) for each in spectral_subspaces(*errors, more)]
         A, _, C, _ = below
+        zeros = np.zeros((len(A), more))
         return [
-            e._replace(A=scipy.linalg.block_diag(A, e.A), C=np.hstack([C, e.C]))
+            (np.block([[A, zeros], [zeros.T, e.A]]), np.hstack([C, e.C]))
             for e in estimates
             if e is not None
         ]
@@ -236,9 +247,10 @@ class OrderFits:
     ) -> tuple[LinearModel, list[Array]]:
         """Return the model in physical units, and its errors in each record."""
         # The states that records begin from depend on the output's offset: a guess comes first.
-        model = self._posed.model(self._without_starts(found))
-        fit, rmse = model.fit, found.rmse
-        assert fit is not None
+        found = self._without_starts(found)
+        model = physical(found, self._scaler, self._about)
+        model = model.transformed(*transformation(self._driven, found.matrices))
+        rmse = found.rmse
         if self._train:
             model = replace(model, y_offset=y_offset)
         errors = [record.y - model.simulate(record) for record, _ in self._train]
@@ -249,9 +261,9 @@ class OrderFits:
                 mean = inside.mean(axis=0)
                 model = replace(model, y_offset=model.y_offset + mean)
                 inside, errors = inside - mean, [each - mean for each in errors]
-            rmse = float(rms(inside / self._posed.scaler.y_scale))
+            rmse = float(rms(inside / self._scaler.y_scale))
         criterion, spent = "simulation" if self._train else "frequency", time.perf_counter() - clock
-        fit = replace(fit, criterion=criterion, rmse=rmse, seconds=spent)
+        fit = LinearFit(criterion, rmse, found.iterations, found.reason, spent)
         return replace(model, fit=fit), errors
 
     def _without_starts(self, found: Refined) -> Refined:

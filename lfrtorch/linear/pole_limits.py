@@ -22,9 +22,6 @@ from lfrtorch._support.types import Array, Complex
 PART = 0.1
 """Penalty of a pole far beyond its limit, relative to the squared error."""
 
-RHO = math.sqrt(PART)
-"""ρ of an error of unit norm."""
-
 REACH = 1 / 3
 """Half width of a pole outside the band, relative to its distance from it. The real pole of
 Bouc-Wen's linear model has 2 / 3."""
@@ -65,3 +62,19 @@ class PoleLimits:
         by_pole = slope / np.where(e > 0, poles, 1.0)
         slopes = by_pole[:, None, None] * W[:, :, None] * V.T[:, None, :]
         return slopes.real.reshape(len(poles), -1)
+
+
+class Excess:
+    """Residuals ρ e at some θ, and their derivative, from those of e and |r|."""
+
+    def __init__(
+        self,
+        e: Float[Array, " nx"],
+        slopes: Float[Array, "nx P"],
+        errors: float,
+        gradient: Float[Array, " P"],
+    ) -> None:
+        root = math.sqrt(PART)
+        self.residual = root * errors * e
+        self.jacobian = root * (errors * slopes + np.outer(e, gradient / max(errors, 1e-300)))
+        self.active = bool(e.any())

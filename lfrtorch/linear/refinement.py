@@ -34,7 +34,7 @@ class Refined:
     rmse: float
     iterations: int
     reason: str
-    constant: Array | float = 0.0  # of the output at rest, if it is a parameter
+    constant: Array | None = None  # of the output at rest, if it is a parameter
     K: Array | None = None
     innovation_covariance: Array | None = None
 

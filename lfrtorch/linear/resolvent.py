@@ -19,19 +19,27 @@ from lfrtorch._support.types import Array, Complex, Integers
 
 
 def solve_resolvent(
+    A: Float[Array, "nx nx"], B: Float[Array, "nx nu"], z: Complex128[Complex, " F"]
+) -> Complex128[Complex, "F nx nu"]:
+    """X = (zI - A)⁻¹ B, by a Schur form A = Q T Qᴴ and back substitution for all z at once."""
+    # Eigenvectors would lose digits if poles lie close together.
+    T, Q = scipy.linalg.schur(A, output="complex")
+    return _substituted(T, Q, (Q.conj().T @ B)[:, :, None], z)
+
+
+def solve_driven(
     A: Float[Array, "nx nx"],
     B: Float[Array, "nx nu"],
     z: Complex128[Complex, " F"],
-    U: Complex128[Complex, "F nu m"] | None = None,
-) -> Complex128[Complex, "F nx n"]:
-    """X = (zI - A)⁻¹ B, or the states X U under inputs: less work if these have fewer columns.
-
-    It takes a Schur form A = Q T Qᴴ, and back substitution for all z at once.
-    """
-    # Eigenvectors would lose digits if poles lie close together.
+    U: Complex128[Complex, "F nu m"],
+) -> Complex128[Complex, "F nx m"]:
+    """(zI - A)⁻¹ B U, the states under inputs: less work than X if these have fewer columns."""
     T, Q = scipy.linalg.schur(A, output="complex")
-    forced = Q.conj().T @ B
-    forced = forced[:, :, None] if U is None else np.tensordot(forced, U, (1, 1)).swapaxes(1, 2)
+    return _substituted(T, Q, np.tensordot(Q.conj().T @ B, U, (1, 1)).swapaxes(1, 2), z)
+
+
+def _substituted(T: Complex, Q: Complex, forced: Complex, z: Complex) -> Complex:
+    """Q (zI - T)⁻¹ forced (nx, m, F or 1), as (F, nx, m)."""
     (nx, m, _), F = forced.shape, len(z)
     X = np.empty((nx, m * F), dtype=complex)
     for k in range(nx - 1, -1, -1):

@@ -10,7 +10,8 @@ poles that the lines do not tell are limited by ``pole_limits``.
 from __future__ import annotations
 
 import math
-from functools import cached_property
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -20,16 +21,17 @@ from torch import Tensor
 
 from lfrtorch._support.types import Array, Booleans, Complex
 from lfrtorch.least_squares.gauge import Reduction, reduction
-from lfrtorch.least_squares.linear_systems import SVDSystem, System
-from lfrtorch.least_squares.residual import LeastSquares, Point
+from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, Point
+from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.least_squares.search import Search
-from lfrtorch.linear.modal_jacobian import ModalColumns, Modes, stacked, with_best_inputs
+from lfrtorch.linear.modal_jacobian import ModalJacobian, Modes, stacked, with_best_inputs
 from lfrtorch.linear.model import linear_cell
-from lfrtorch.linear.pole_limits import RHO, PoleLimits
+from lfrtorch.linear.pole_limits import PART, Excess, PoleLimits
 from lfrtorch.linear.refinement import TOLERANCE, TRUNCATION, Matrices, Refined, refining
 from lfrtorch.linear.resolvent import (
     frequency_response,
     response_jacobian,
+    solve_driven,
     solve_left,
     solve_resolvent,
 )
@@ -104,9 +106,8 @@ class ResponseFit:
         columns = np.concatenate([of_B, of_D])
         F, _, m = self.data.U.shape
         L, rest = solve_left(A, C, self.data.z), np.zeros((F, nx, m), dtype=complex)
-        J = self.data.weighted(response_jacobian(rest, L, self.data.U, columns))
-        J, r = (stacked(part).numpy() for part in (J, self.data.weighted(self.data.Y)))
-        J = J.reshape(len(r), -1)
+        J = _real(self.data.weighted(response_jacobian(rest, L, self.data.U, columns))).numpy()
+        r = _real(self.data.weighted(self.data.Y)).numpy()
         if not np.isfinite(J).all():
             return np.inf, matrices
         size = np.linalg.norm(J, axis=0)
@@ -118,9 +119,8 @@ class ResponseFit:
         return float(np.sum((r - J @ best) ** 2)), matrices
 
     def state_deviation(self, matrices: Matrices) -> Array:
-        """Standard deviation (nx,) of the states under the inputs, the first ones, that B has."""
-        A, B, _, _ = matrices
-        states = solve_resolvent(A, B, self.data.z) @ self.data.U[:, : B.shape[1]]
+        """Standard deviation (nx,) of the states."""
+        states = solve_resolvent(*matrices[:2], self.data.z) @ self.data.U
         return np.sqrt((np.abs(states) ** 2).sum(axis=(0, 2)))
 
     def search(self, matrices: Matrices) -> Search:
@@ -157,11 +157,10 @@ class ResponseFit:
     def refined(self, search: Search) -> Refined:
         """Return the present result of a search, with its covariance."""
         problem, state = search.problem, search.state
-        at = problem.at(state.theta)
         return Refined(
-            *at.matrices,
+            *problem.matrices(state.theta),
             covariance=problem.covariance(state.theta, self.known) if state.iteration else None,
-            rmse=float(np.linalg.norm(at.errors) / math.sqrt(self.data.Y.size)),
+            rmse=float(np.linalg.norm(problem.errors(state.theta)) / math.sqrt(self.data.Y.size)),
             iterations=state.iteration,
             reason=search.reason,
         )
@@ -186,7 +185,7 @@ class ResponseProblem(LeastSquares):
         by_modes: bool = False,
         limits: PoleLimits | None = None,
     ) -> None:
-        self.data, self.largest_pole = data, largest_pole
+        self.data, self.largest_pole, self._together = data, largest_pole, together
         nu, ny = data.U.shape[1], data.Y.shape[1]
         self.shapes = (nx, nx), (nx, nu), (ny, nx), (ny, nu)
         free = [np.ones(shape, dtype=bool) for shape in self.shapes]
@@ -195,46 +194,49 @@ class ResponseProblem(LeastSquares):
         self._free = free[3]
         fixed = torch.as_tensor(~np.concatenate([part.ravel() for part in free]))
         self._fixed = fixed if fixed.any() else None
-        self._together, self._by_modes, self._limits = together, by_modes, limits
+        self._by_modes = by_modes
+        self._limits = limits
         self._reduced: Reduction | None = None
 
-    def at(self, theta: Tensor) -> LinearPoint:
-        """The model at θ (P,)."""
+    def matrices(self, theta: Tensor) -> list[Array]:
+        """A, B, C, D of θ (P,)."""
+        parts = theta.numpy()
         ends = np.cumsum([rows * columns for rows, columns in self.shapes])
-        parts = zip(np.split(theta.numpy(), ends[:-1]), self.shapes, strict=True)
-        matrices = [part.reshape(shape) for part, shape in parts]
-        return LinearPoint(self.data, matrices, together=self._together, by_modes=self._by_modes)
+        return [p.reshape(s) for p, s in zip(np.split(parts, ends[:-1]), self.shapes, strict=True)]
 
     def evaluate(self, theta: Tensor, near: Point | None = None) -> Point:
         """Weighted G U - Y, real parts then imaginary parts, then ρ e, (2 F ny m + nx,)."""
-        at = self.at(theta)
-        if not np.abs(at.poles).max() < self.largest_pole:
+        at = self._at(theta)
+        if at.errors is None:
             size = 2 * self.data.Y.size + len(at.poles)
             residual = torch.full((size,), torch.inf, dtype=torch.float64)
+        elif self._limits is None:
+            residual = stacked(at.errors, np.zeros(len(at.poles)))
         else:
-            e = (
-                np.zeros(len(at.poles))
-                if self._limits is None
-                else self._limits.excess(at.poles)[0]
-            )
-            residual = stacked(at.errors, RHO * np.linalg.norm(at.errors) * e)
+            e, _ = self._limits.excess(at.poles)
+            residual = stacked(at.errors, math.sqrt(PART) * np.linalg.norm(at.errors) * e)
         return Point(theta, residual, float(residual.square().sum()), (at,))
 
     def residual(self, theta: Tensor) -> Tensor:
         """The same, of a θ alone."""
         return self.evaluate(theta).residual
 
-    def linearise_at(self, point: Point) -> ResponseJacobian:
+    def linearise_at(self, point: Point) -> ResponseJacobian | ModalJacobian:
         """Return the Jacobian, without the columns of a change of state coordinates."""
-        at: LinearPoint = point.seen[0]
-        columns = (
-            self._kept(at) if at.modes is None else ModalColumns(at.modes, self.data, self._free)
-        )
-        return ResponseJacobian(columns, at.errors, *self._excess(at, len(point.theta)))
+        at: _At = point.seen[0]
+        assert at.errors is not None
+        excess = self._excess(at, len(point.theta))
+        if at.modes is not None:
+            return ModalJacobian(at.modes, self.data, at.errors, free=self._free, excess=excess)
+        return ResponseJacobian(*self._jacobian(at), at.errors, excess)
 
-    def linearise(self, theta: Tensor) -> ResponseJacobian:
+    def linearise(self, theta: Tensor) -> ResponseJacobian | ModalJacobian:
         """The same, of a θ alone."""
         return self.linearise_at(self.evaluate(theta))
+
+    def errors(self, theta: Tensor) -> Complex:
+        """Weighted G U - Y (F, ny, m)."""
+        return self._errors(self._at(theta))
 
     def covariance(self, theta: Tensor, known: bool) -> Array:
         """Return the covariance (P, P) of θ at the minimum.
@@ -242,132 +244,119 @@ class ResponseProblem(LeastSquares):
         Unless the weights are ``known`` to be inverse variances, the error found at each line
         stands for its variance (White's estimate).
         """
-        at = self.at(theta)
-        return self._kept(at).covariance(self.data, at.errors, known=known)
+        at, nx = self._at(theta), self.shapes[0][0]
+        none = np.zeros(nx), np.zeros((nx, len(theta)))
+        jacobian = ResponseJacobian(*self._jacobian(at), self._errors(at), none)
+        return jacobian.covariance(self.data, known=known)
 
-    def _kept(self, at: LinearPoint) -> KeptColumns:
+    def _at(self, theta: Tensor) -> _At:
+        """The model at θ."""
+        matrices = self.matrices(theta)
+        modes = Modes.of(*matrices) if self._by_modes else None
+        poles = np.linalg.eigvals(matrices[0]) if modes is None else modes.poles
+        at = _At(matrices, np.asarray(poles, dtype=np.complex128), modes)
+        if not np.abs(poles).max() < self.largest_pole:
+            return at
+        if modes is None:
+            at = at._replace(states=self._states(matrices))
+        return at._replace(errors=self._errors(at))
+
+    def _errors(self, at: _At) -> Complex:
+        if at.errors is not None:
+            return at.errors
+        U = self.data.U
+        if at.modes is not None:
+            return self.data.weighted(at.modes.response(self.data.z) @ U - self.data.Y)
+        _, _, C, D = at.matrices
+        X = self._states(at.matrices) if at.states is None else at.states
+        response = C @ X + D @ U if self._together else (C @ X + D) @ U
+        return self.data.weighted(response - self.data.Y)
+
+    def _states(self, matrices: Sequence[Array]) -> Complex:
+        """Return (zI - A)⁻¹ B, times U if ``together``."""
+        A, B, _, _ = matrices
+        z = self.data.z
+        return solve_driven(A, B, z, self.data.U) if self._together else solve_resolvent(A, B, z)
+
+    def _jacobian(self, at: _At) -> tuple[Complex, Reduction]:
         """Weighted derivative of G U in the columns that are kept, and how these give all."""
         A, _, C, _ = at.matrices
         initial_states = torch.zeros(0, len(A), dtype=torch.float64)
         cell = linear_cell(*at.matrices)
         self._reduced = reduction(cell, initial_states, before=self._reduced, fixed=self._fixed)
+        X = self._states(at.matrices) if at.states is None else at.states
         U, L = self.data.U, solve_left(A, C, self.data.z)
-        driven = at.states if self._together else at.states @ U
-        J = response_jacobian(driven, L, U, self._reduced.kept.numpy())
-        return KeptColumns(self.data.weighted(J), self._reduced)
+        J = response_jacobian(X if self._together else X @ U, L, U, self._reduced.kept.numpy())
+        return self.data.weighted(J), self._reduced
 
-    def _excess(self, at: LinearPoint, parameters: int) -> tuple[Array, Array]:
+    def _excess(self, at: _At, parameters: int) -> tuple[Array, Array]:
         """Excess (nx,) of each pole over its limit, and its derivative (nx, P) with θ."""
-        nx = len(at.poles)
-        slopes = np.zeros((nx, parameters))
-        if self._limits is None:
-            return np.zeros(nx), slopes
-        e, _ = self._limits.excess(at.poles)
-        if e.any():
-            slopes[:, : nx * nx] = self._limits.slopes(*at.eigen)
+        poles = at.poles
+        e, slopes = np.zeros(len(poles)), np.zeros((len(poles), parameters))
+        if self._limits is not None:
+            e, _ = self._limits.excess(poles)
+            if e.any():
+                if at.modes is not None:
+                    poles, V, W = at.modes[:3]
+                else:
+                    eigen = np.linalg.eig(at.matrices[0])
+                    poles, V = (np.asarray(part, dtype=np.complex128) for part in eigen)
+                    W = np.asarray(np.linalg.pinv(V), dtype=np.complex128)
+                slopes[:, : V.size] = self._limits.slopes(poles, V, W)
         return e, slopes
 
 
-class LinearPoint:
-    """A linear model at one θ: what its residual and its derivatives share."""
+class _At(NamedTuple):
+    """A linear model at one θ."""
 
-    def __init__(
-        self, data: SpectralData, matrices: list[Array], *, together: bool, by_modes: bool
-    ) -> None:
-        self.matrices, self._data, self._together = matrices, data, together
-        self.modes = Modes.of(*matrices) if by_modes else None  # that derivatives are computed by
-
-    @cached_property
-    def poles(self) -> Complex128[Complex, " nx"]:
-        """Poles."""
-        if self.modes is not None:
-            return self.modes.poles
-        return np.asarray(np.linalg.eigvals(self.matrices[0]), dtype=np.complex128)
-
-    @property
-    def eigen(self) -> tuple[Complex, Complex, Complex]:
-        """Poles, eigenvectors V of A and V⁻¹."""
-        if self.modes is not None:
-            return self.modes[:3]
-        poles, V = (np.asarray(m, dtype=np.complex128) for m in np.linalg.eig(self.matrices[0]))
-        return poles, V, np.asarray(np.linalg.pinv(V), dtype=np.complex128)
-
-    @cached_property
-    def states(self) -> Complex:
-        """(zI - A)⁻¹ B, times U if the problem has all inputs together."""
-        A, B, _, _ = self.matrices
-        return solve_resolvent(A, B, self._data.z, self._data.U if self._together else None)
-
-    @cached_property
-    def errors(self) -> Complex128[Complex, "F ny m"]:
-        """Weighted G U - Y."""
-        (_, _, C, D), U = self.matrices, self._data.U
-        if self.modes is not None:
-            response = self.modes.response(self._data.z) @ U
-        else:
-            response = C @ self.states + D @ U if self._together else (C @ self.states + D) @ U
-        return self._data.weighted(response - self._data.Y)
+    matrices: list[Array]
+    poles: Complex128[Complex, " nx"]
+    modes: Modes | None  # if derivatives are computed by them
+    states: Complex | None = None  # (zI - A)⁻¹ B, times U if the problem has them together
+    errors: Complex128[Complex, "F ny m"] | None = None  # None if a pole passes the limit
 
 
 class ResponseJacobian:
-    """Jacobian of the residual with θ: columns of the errors, and rows of poles beyond limits."""
+    """Jacobian of the residual with θ, from the columns of the errors that are kept."""
 
     def __init__(
         self,
-        columns: KeptColumns | ModalColumns,
+        J: Complex128[Complex, "F ny m K"],
+        reduced: Reduction,
         errors: Complex128[Complex, "F ny m"],
-        e: Float[Array, " nx"],
-        slopes: Float[Array, "nx P"],
+        excess: tuple[Float[Array, " nx"], Float[Array, "nx P"]],
     ) -> None:
-        self.columns, self._gradient = columns, columns.gradient(stacked(errors)).numpy()
-        size = float(np.linalg.norm(errors))
-        self._excess = RHO * size * e
-        self._rows = RHO * (size * slopes + np.outer(e, self._gradient / max(size, 1e-300)))
+        self._J, self._reduced, self._errors = J, reduced, errors
+        self._rows, r, e = _real(J), _real(errors), excess[0]
+        self._more: Excess | None = None
+        self._residual, self._poles = r, len(e)
+        if e.any():
+            gradient = reduced.gradient(self._rows.mT @ r)
+            self._more = Excess(*excess, float(torch.linalg.norm(r)), gradient.numpy())
+            rows = torch.as_tensor(self._more.jacobian)[:, reduced.kept]
+            self._rows = torch.cat([self._rows, rows])
+            self._residual = torch.cat([r, torch.as_tensor(self._more.residual)])
 
-    def system(self, damping: float, truncation: float) -> tuple[System, Tensor]:
-        """Return the system and the gradient, see ``residual.Jacobian``."""
-        gradient = torch.as_tensor(self._gradient + self._rows.T @ self._excess)
-        more = self._rows if self._excess.any() else None
-        return self.columns.system(truncation, more), gradient
+    def system(self, damping: float, truncation: float) -> tuple[SVDSystem, Tensor]:
+        """Return the system and the gradient, see ``levenberg_marquardt.Jacobian``."""
+        R = torch.linalg.qr(self._rows, mode="r").R
+        return SVDSystem(self._reduced.columns(R), truncation), self._adjoint(self._residual)
 
     def tangent(self, d_theta: Tensor) -> Tensor:
         """J d_theta."""
-        of_poles = torch.as_tensor(self._rows @ d_theta.numpy())
-        return torch.cat([self.columns.tangent(d_theta), of_poles])
+        found = self._rows @ self._reduced.reduced(d_theta)
+        return found if self._more else torch.cat([found, found.new_zeros(self._poles)])
 
     def adjoint(self, residual: Tensor) -> Tensor:
         """Jᵀ residual (P,)."""
-        of_poles = residual[len(residual) - len(self._excess) :]
-        gradient = self.columns.gradient(residual[: len(residual) - len(of_poles)])
-        return gradient + torch.as_tensor(self._rows.T @ of_poles.numpy())
+        return self._adjoint(residual if self._more else residual[: len(residual) - self._poles])
 
+    def _adjoint(self, residual: Tensor) -> Tensor:
+        return self._reduced.gradient(self._rows.mT @ residual)
 
-class KeptColumns:
-    """Derivative of the errors in the columns that gauge directions leave."""
-
-    def __init__(self, J: Complex128[Complex, "F ny m K"], reduced: Reduction) -> None:
-        self._J, self._reduced = J, reduced
-        self._rows = stacked(J).view(-1, J.shape[-1])
-
-    def system(self, truncation: float, more: Float[Array, "n P"] | None = None) -> SVDSystem:
-        """The system of these columns, and of more rows."""
-        rows = self._rows
-        if more is not None:
-            rows = torch.cat([rows, torch.as_tensor(more)[:, self._reduced.kept]])
-        R = torch.linalg.qr(rows, mode="r").R
-        return SVDSystem(self._reduced.columns(R), truncation)
-
-    def tangent(self, d_theta: Tensor) -> Tensor:
-        """J d_theta."""
-        return self._rows @ self._reduced.reduced(d_theta)
-
-    def gradient(self, r: Tensor) -> Tensor:
-        """Jᵀ r (P,)."""
-        return self._reduced.gradient(self._rows.mT @ r)
-
-    def covariance(self, data: SpectralData, errors: Complex, *, known: bool) -> Array:
+    def covariance(self, data: SpectralData, *, known: bool) -> Array:
         """Covariance (P, P) of θ at the minimum, see ``ResponseProblem.covariance``."""
-        inverse = self.system(TRUNCATION).inverse.numpy()
+        inverse = self.system(0.0, TRUNCATION)[0].inverse.numpy()
         if known and data.errors is None:
             return inverse / 2  # a complex error of variance 1 has real parts of variance 1/2
         # Sandwich (JᴴJ)⁻¹ cov(Σ s) (JᴴJ)⁻¹ with the scores s = Re(Jᴴ r) of the lines.
@@ -379,6 +368,12 @@ class KeptColumns:
 
         if data.errors is not None:
             return data.errors.covariance(lambda e: scores(data.weighted(e)), len(inverse))
-        root = scores(errors).real  # whose squares are positive, whatever the rounding
-        M, K = 2 * errors.size, self._J.shape[-1]
+        root = scores(self._errors).real  # whose squares are positive, whatever the rounding
+        M, K = 2 * self._errors.size, self._rows.shape[1]
         return root.T @ root * (M / max(1, M - K))
+
+
+def _real(errors: Complex) -> Tensor:
+    """Real parts, then imaginary parts: (F, ny, m[, K]) -> (2 F ny m[, K])."""
+    flat = errors.reshape(-1, *errors.shape[3:])
+    return torch.as_tensor(np.concatenate([flat.real, flat.imag]))

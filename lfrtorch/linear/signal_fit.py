@@ -19,13 +19,11 @@ import numpy as np
 import scipy
 import torch
 from torch import Tensor
-from torch.func import jacrev
 
 from lfrtorch._support.types import Array
 from lfrtorch.data.records import PAST_OUTPUTS, NormalisedRecord
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
-from lfrtorch.engine.weights import Weights
 from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.search import Search
@@ -147,26 +145,28 @@ class SignalFit:
     def refined(self, search: Search) -> Refined:
         """Return the present result of a search, with its covariance."""
         problem, state = search.problem, search.state
-        weights = problem.errors.parameters.weights
-        W = weights(state.theta)
-        A, B, C, D, K = (m.numpy().copy() for m in self._system(W))
-        constant = 0.0
-        if self._offset:
-            constant = W.Dyu[:, -1].numpy()
-            at_rest = np.linalg.solve(np.eye(len(A)) - A, K @ constant + W.Bu[:, -1].numpy())
-            constant = np.asarray(constant + C @ at_rest, dtype=np.float64)
+        problem.write(state.theta)
+        cell = problem.lfr.cell
+        A, Bu, C, Dyu = (m.detach().numpy() for m in (cell.A, cell.Bu, cell.Cy, cell.Dyu))
+        nu, ny = self.nu, self.ny
+        B, D, K = Bu[:, :nu].copy(), Dyu[:, :nu].copy(), np.zeros((len(A), ny))
+        constant = Dyu[:, -1].copy() if self._offset else None
+        if self._prediction:
+            K = Bu[:, nu : nu + ny].copy()
+            if constant is not None:  # at rest, where the predictor sees this same output
+                driven = K @ constant + Bu[:, -1]
+                at_rest = np.linalg.solve(np.eye(len(A)) - A - K @ C, driven)
+                constant = np.asarray(constant + C @ at_rest, dtype=np.float64)
         system, _ = problem.linearise_at(state.point, eliminate=False).system(0.0, TRUNCATION)
         assert isinstance(system, SVDSystem)
         covariance = None
         if state.iteration:
-            J = jacrev(lambda theta: torch.cat([*map(torch.ravel, self._system(weights(theta)))]))
-            change = J(state.theta).numpy()[: -K.size]
             spread = self._spread(problem, state.theta, state.cost, system)
-            covariance = change @ spread @ change.T
+            covariance = self._of_system(spread, C, D, K)
         found = Refined(
-            A,
-            B,
-            C,
+            A + K @ C,
+            B + K @ D,
+            C.copy(),
             D,
             covariance=covariance,
             rmse=math.sqrt(state.cost / problem.size),
@@ -255,13 +255,23 @@ class SignalFit:
         P = scipy.linalg.solve_discrete_are(A.T, C.T, np.diag(variances), np.eye(self.ny))
         return np.linalg.solve(C @ P @ C.T + np.eye(self.ny), C @ P @ A.T).T
 
-    def _system(self, W: Weights) -> tuple[Tensor, ...]:
-        """A, B, C, D and K of the system that a cell simulates or predicts."""
-        nu, K = self.nu, W.A.new_zeros(W.nx, self.ny)
+    def _of_system(self, covariance: Array, C: Array, D: Array, K: Array) -> Array:
+        """Covariance of A, B, C, D from that of the cell's parameters and initial states."""
+        nx, nu, ny, width = len(K), self.nu, self.ny, self._driven[0].u.shape[1]
+        sizes = [nx * nx, nx * width, ny * nx, ny * width]
+        ends = np.cumsum(sizes)
+        cells = np.split(np.eye(ends[-1], len(covariance)), ends[:-1])
+        Bu = cells[1].reshape(nx, width, -1)
+        Dyu = cells[3].reshape(ny, width, -1)[:, :nu].reshape(ny * nu, -1)
+        dB = Bu[:, :nu].reshape(nx * nu, -1)
+        dA, dC = cells[0], cells[2]
         if self._prediction:
-            K = W.Bu[:, nu : nu + self.ny]
-        D = W.Dyu[:, :nu]
-        return W.A + K @ W.Cy, W.Bu[:, :nu] + K @ D, W.Cy, D, K
+            dK = Bu[:, nu : nu + ny].reshape(nx * ny, -1)
+            eye = np.eye(nx)
+            dA = dA + np.kron(eye, C.T) @ dK + np.kron(K, eye) @ dC
+            dB = dB + np.kron(eye, D.T) @ dK + np.kron(K, np.eye(nu)) @ Dyu
+        change = np.vstack([dA, dB, dC, Dyu])
+        return change @ covariance @ change.T
 
 
 class _PoleWall(Term):

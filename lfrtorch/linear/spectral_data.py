@@ -86,27 +86,38 @@ def spectral_data_of_records(
     if ny > 1 and any(np.ptp(r.weight) > 0 or r.line_weight is not None for r in records):
         return None
     groups: dict[int, list[_Lines]] = {}
+    references = given_references(records)
+    means: list[tuple[Complex, Complex, float]] = []
     total = sum(record.samples for record in records)
-    for each, r in zip(normalised, given_references(records), strict=True):
-        record, (T, nu) = each.record, each.u.shape
-        N = record.period or T
-        weight = np.max(record.weight) * _twice(N) * T / total
+    for each, r in zip(normalised, references, strict=True):
+        u, y, record = each.u, each.y, each.record
+        N = record.period or len(u)
+
+        def periods(signal: Array, N: int = N) -> Complex:
+            return np.fft.rfft(signal.reshape(-1, N, signal.shape[1]), axis=1) / N
+
+        U, Y = (np.fft.rfft(s.reshape(-1, N, s.shape[1]).mean(0), axis=0) / N for s in (u, y))
+        weight = np.max(record.weight) * _twice(N) * len(u) / total
         if record.line_weight is not None:
-            weight = weight * record.line_weight[:: T // N]
-        root, P = np.sqrt(weight), T // N
-        signals = np.hstack([each.u, each.y]).reshape(P, N, -1)
-        mean, noise = root * (np.fft.rfft(signals.mean(axis=0), axis=0) / N), None
-        if P > 1 and np.ptp(signals[..., :nu], axis=0).any():
-            Z = (np.fft.rfft(signals, axis=1) / N).swapaxes(0, 1)
-            noise = outer(root[:, None] * (Z - Z.mean(axis=1, keepdims=True))) / (P * (P - 1))
-        reference = None
-        if r is not None:
-            reference = root * (np.fft.rfft(r.reshape(P, N, nu), axis=1) / N).mean(axis=0)
-        own = _Lines(mean[:, :nu], mean[:, nu:], noise, reference, float(root[0, 0]))
-        groups.setdefault(N, []).append(own)
-    parts = [_line_0([record for group in groups.values() for record in group], offset=offset)]
+            weight = weight * record.line_weight[:: len(u) // N]
+        root = np.sqrt(weight)
+        means.append((root[0] * U[0], root[0] * Y[0], float(root[0, 0])))
+        noise = None
+        if len(u) > N and np.ptp(u.reshape(-1, N, u.shape[1]), axis=0).any():
+            Z = np.concatenate([periods(u), periods(y)], axis=2).swapaxes(0, 1)
+            P = Z.shape[1]
+            noise = outer(root[:, :, None] * (Z - Z.mean(axis=1, keepdims=True))) / (P * (P - 1))
+        groups.setdefault(N, []).append(
+            _Lines(
+                root[1:] * U[1:],
+                root[1:] * Y[1:],
+                None if noise is None else noise[1:],
+                None if r is None else root[1:] * periods(r).mean(axis=0)[1:],
+            )
+        )
+    parts = [_line_0(means, offset=offset)]
     for N, group in groups.items():
-        z = np.exp(2j * np.pi * np.arange(1, N // 2 + 1) / N)
+        z = np.exp(2j * np.pi * np.arange(1, len(group[0].U) + 1) / N)
         parts.append((z, *_together(group)))
     m = max(U.shape[2] for _, U, _ in parts)
 
@@ -158,37 +169,35 @@ def _twice(N: int) -> Array:
     return twice
 
 
-class _Lines(NamedTuple):
-    """Weighted spectra of a record, means over the periods."""
-
-    U: Complex
-    Y: Complex
-    noise: Complex | None  # covariance of the noise of [U, Y]
-    reference: Complex | None
-    constant: float  # the spectrum of 1 at line 0
-
-
-def _sides(records: Sequence[_Lines]) -> tuple[list[Complex], list[Complex]]:
-    return [record.U for record in records], [record.Y for record in records]
-
-
-def _line_0(records: list[_Lines], *, offset: bool) -> tuple[Complex, Complex, Complex]:
+def _line_0(
+    means: list[tuple[Complex, Complex, float]], *, offset: bool
+) -> tuple[Complex, Complex, Complex]:
     """Line 0 of all records, projected across a constant that is common to them."""
-    U, Y = (np.stack([lines[0] for lines in side], axis=-1) for side in _sides(records))
+    U, Y = (np.stack([mean[side] for mean in means], axis=-1) for side in (0, 1))
     if offset:
-        one = np.array([record.constant for record in records])
+        one = np.array([weight for _, _, weight in means])
         one /= max(float(np.linalg.norm(one)), np.finfo(float).tiny)
         U, Y = (S - np.outer(S @ one, one) for S in (U, Y))
     return np.ones(1, dtype=complex), *_compressed(U[None], Y[None])
 
 
+class _Lines(NamedTuple):
+    """Weighted spectra of a record at lines from 1 on, means over the periods."""
+
+    U: Complex
+    Y: Complex
+    noise: Complex | None  # covariance of the noise of [U, Y]
+    reference: Complex | None
+
+
 def _together(group: Sequence[_Lines]) -> tuple[Complex, Complex]:
-    """U and Y from line 1 on in at most nu columns, of records of one period, without U's noise."""
-    U, Y = (np.stack([lines[1:] for lines in side], axis=-1) for side in _sides(group))
+    """U and Y in at most nu columns, of records of one period, without the noise of U."""
+    U = np.stack([record.U for record in group], axis=-1)
+    Y = np.stack([record.Y for record in group], axis=-1)
     nu, R = U.shape[1:]
-    shares = [record.noise[1:] for record in group if record.noise is not None]
+    shares = [record.noise for record in group if record.noise is not None]
     noise = np.sum(shares, axis=0) if shares else None
-    known = [record.reference[1:] for record in group if record.reference is not None]
+    known = [record.reference for record in group if record.reference is not None]
     excited = None
     if known:
         reference = np.stack(known, axis=-1)

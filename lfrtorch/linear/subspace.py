@@ -23,7 +23,7 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -84,39 +84,29 @@ def from_spectra(
     return [estimate for estimate in found if estimate is not None]
 
 
-class Subspace(NamedTuple):
+class SpectralSubspace(NamedTuple):
     """Directions that hold estimates of every order, from one decomposition."""
 
     directions: Array  # of the outputs that the inputs do not explain, the main one first
     singular_values: Array
     size: float  # norm of the outputs
+    whiten: Array  # what the noise of the outputs was divided by
+    warp: float  # a of the bilinear map of the frequency axis
     ny: int
-    whiten: Array | None = None  # what the noise of the outputs was divided by
-    warp: float | None = None  # a of the bilinear map of the frequency axis
-
-    @classmethod
-    def of(cls, outputs: Array, seen: slice, *more: Any) -> Self:
-        """Decompose the columns ``seen`` of the outputs."""
-        U, s, _ = np.linalg.svd(outputs[:, seen])
-        return cls(U, s, max(float(np.linalg.norm(outputs)), np.finfo(float).tiny), *more)
 
     def estimate(self, nx: int) -> SubspaceEstimate | None:
         """Return the estimate of an order, if there are directions for it and an inverse map."""
         if nx > len(self.directions):
             return None
-        s, ny, a = self.singular_values, self.ny, self.warp
-        observability = self.directions[:, :nx] * np.sqrt(np.pad(s, (0, max(0, nx - len(s))))[:nx])
-        if self.whiten is not None:
-            observability = self.whiten @ observability
-        # Of [C; C A; C A²; ...] the first rows are C, and A moves each block to the next one.
-        A = np.linalg.lstsq(observability[:-ny], observability[ny:], rcond=None)[0]
-        C, eye = observability[:ny], np.eye(nx)
-        if a is not None:
-            try:  # A = (A_axis + a I) (I + a A_axis)⁻¹ takes the bilinear map back
-                A = np.linalg.solve((eye + a * A).T, (A + a * eye).T).T
-            except np.linalg.LinAlgError:
-                return None
-        return _stable(np.asarray(A, dtype=np.float64), C, s / self.size)
+        observability = _main(self.directions, self.singular_values, nx)
+        A_axis, C = _shift(self.whiten @ observability, self.ny)
+        a, eye = self.warp, np.eye(nx)
+        try:  # A = (A_axis + a I) (I + a A_axis)⁻¹ takes the bilinear map back
+            A = np.linalg.solve((eye + a * A_axis).T, (A_axis + a * eye).T).T
+        except np.linalg.LinAlgError:
+            return None
+        s = self.singular_values / self.size
+        return _stable(np.asarray(A, dtype=np.float64), C, s)
 
 
 def spectral_subspaces(
@@ -124,7 +114,7 @@ def spectral_subspaces(
     U: Complex128[Complex, "F nu m"],
     Y: Complex128[Complex, "F ny m"],
     most: int,
-) -> list[Subspace]:
+) -> list[SpectralSubspace]:
     """Subspaces for the orders up to ``most``, or what these lines carry; see ``from_spectra``."""
     rows = {min(multiple * (most + 1), _most_rows(U, Y)) for multiple in _SPECTRAL_HORIZONS}
     return [each for q in sorted(rows) if q > 1 for each in _subspaces(z, U, Y, q)]
@@ -135,7 +125,7 @@ def _most_rows(U: Complex, Y: Complex) -> int:
     return 2 * len(U) * U.shape[2] // (U.shape[1] + Y.shape[1])
 
 
-def _subspaces(z: Complex, U: Complex, Y: Complex, q: int) -> list[Subspace]:
+def _subspaces(z: Complex, U: Complex, Y: Complex, q: int) -> list[SpectralSubspace]:
     """Return subspaces of q block rows, on several frequency axes, with and without equal noise."""
     ny, half = Y.shape[1], np.angle(z) / 2
     power = (np.abs(Y) ** 2).sum(axis=(1, 2))
@@ -160,7 +150,8 @@ def _subspaces(z: Complex, U: Complex, Y: Complex, q: int) -> list[Subspace]:
             # The inverse root gives all rows the same noise; it is undone on the subspace.
             whiten = np.asarray(np.kron(root, np.eye(ny)), dtype=np.float64)
             outputs = scipy.linalg.solve_triangular(whiten, L[first:], lower=True)
-            found.append(Subspace.of(outputs, slice(first, None), ny, whiten, float(a)))
+            directions, s, size = _directions(outputs, slice(first, None))
+            found.append(SpectralSubspace(directions, s, size, whiten, float(a), ny))
     return found
 
 
@@ -187,8 +178,9 @@ def from_signals(
         L = _lower(np.vstack([U[i * nu :], U[: i * nu], Y[: i * ny], Y[i * ny :]]))
         inputs, past_u, past = i * nu, 2 * i * nu, i * (2 * nu + ny)
         for instruments in (past, past_u):
-            found = Subspace.of(L[past:], slice(inputs, instruments), ny).estimate(nx)
-            estimates += [] if found is None else [found]
+            directions, s, size = _directions(L[past:], slice(inputs, instruments))
+            A, C = _shift(_main(directions, s, nx), ny)
+            estimates.append(_stable(A, C, s / size))
     return estimates
 
 
@@ -209,6 +201,23 @@ def _lower(rows: Array) -> Array:
     L = np.zeros((len(rows), len(rows)))
     L[:, : len(R[: len(rows)])] = R[: len(rows)].T
     return L
+
+
+def _directions(outputs: Array, seen: slice) -> tuple[Array, Array, float]:
+    """Main directions of the columns ``seen``, their singular values, and the outputs' size."""
+    U, s, _ = np.linalg.svd(outputs[:, seen])
+    return U, s, max(float(np.linalg.norm(outputs)), np.finfo(float).tiny)
+
+
+def _main(directions: Array, s: Array, nx: int) -> Array:
+    """Return the first nx directions, scaled."""
+    return directions[:, :nx] * np.sqrt(np.pad(s, (0, max(0, nx - len(s))))[:nx])
+
+
+def _shift(observability: Array, ny: int) -> tuple[Array, Array]:
+    """Return A and C from the extended observability matrix [C; C A; C A²; ...]."""
+    A = np.linalg.lstsq(observability[:-ny], observability[ny:], rcond=None)[0]
+    return np.asarray(A, dtype=np.float64), observability[:ny]
 
 
 def _stable(A: Array, C: Array, singular_values: Array) -> SubspaceEstimate:

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from reference import POLES, random_system, special_poles
 
 from lfrtorch import Record, estimate_bla
-from lfrtorch.linear.modal_jacobian import ModalColumns, Modes, with_best_inputs
+from lfrtorch.linear.modal_jacobian import ModalJacobian, Modes, with_best_inputs
 from lfrtorch.linear.pole_limits import PoleLimits
 from lfrtorch.linear.resolvent import frequency_response
-from lfrtorch.linear.response_fit import KeptColumns, ResponseFit, ResponseProblem
+from lfrtorch.linear.response_fit import ResponseFit, ResponseJacobian, ResponseProblem
 from lfrtorch.linear.spectral_data import SpectralData
 
 pytestmark = pytest.mark.numeric
@@ -53,8 +53,8 @@ def test_residual_slope_and_system_are_those_of_the_general_path(weighted: bool)
     assert r[-NX:].abs().max() > 0  # some poles are beyond their limits
     np.testing.assert_allclose(r, general.residual(theta), rtol=1e-9, atol=1e-9)
     ours, theirs = modal.linearise(theta), general.linearise(theta)
-    assert isinstance(ours.columns, ModalColumns)
-    assert isinstance(theirs.columns, KeptColumns)
+    assert isinstance(ours, ModalJacobian)
+    assert isinstance(theirs, ResponseJacobian)
     (system, gradient), (expected, same) = (j.system(1.0, 1e-12) for j in (ours, theirs))
     size = float(same.abs().max())
     np.testing.assert_allclose(gradient, same, rtol=0, atol=1e-9 * size)
@@ -103,7 +103,7 @@ def test_defective_matrix_has_no_modes_and_is_fitted_all_the_same():
     problem = ResponseProblem(SpectralData(data.z, data.U, G @ data.U), 3, by_modes=True)
     theta = torch.as_tensor(np.concatenate([m.ravel() for m in (A, B, C, D)]))
     assert float(problem.residual(theta).abs().max()) < 1e-9
-    assert isinstance(problem.linearise(theta).columns, KeptColumns)
+    assert isinstance(problem.linearise(theta), ResponseJacobian)
 
 
 def test_one_input_and_output_are_fitted_by_modes_as_well(monkeypatch: pytest.MonkeyPatch):

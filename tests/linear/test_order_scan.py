@@ -17,7 +17,7 @@ from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.order_scan import OrderScan, memory_of, scan_orders
-from lfrtorch.linear.subspace import Subspace
+from lfrtorch.linear.subspace import SpectralSubspace
 
 pytestmark = pytest.mark.numeric
 
@@ -70,7 +70,7 @@ def test_planted_order_is_chosen(validated: bool, scan: OrderScan, monkeypatch):
 def test_work_grows_with_the_orders_that_are_tried_and_not_with_the_highest(monkeypatch):
     asked, made = [], order_fits.spectral_subspaces
 
-    def noted(*spectra: Any) -> list[Subspace]:
+    def noted(*spectra: Any) -> list[SpectralSubspace]:
         asked.append(spectra[-1])
         return made(*spectra)
 

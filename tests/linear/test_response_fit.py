@@ -307,7 +307,7 @@ def test_coordinates_have_no_columns():
 
 def test_pole_beyond_the_limit_is_refused():
     problem, theta = some_problem()
-    A = problem.at(theta).matrices[0]
+    A = problem.matrices(theta)[0]
     radius = np.abs(np.linalg.eigvals(A)).max()
     limited = ResponseProblem(problem.data, 4, largest_pole=0.999 * radius)
     assert torch.isinf(limited.residual(theta)).all()
