@@ -81,7 +81,8 @@ nitpick_ignore_regex = [
     ("py:.*", r"(collections|jaxtyping|matplotlib|numpy|pathlib|scipy|threading|torch|typing)\..*"),
     ("py:class", r"\w+"),  # an alias, or a type variable
     ("py:class", r"lfrtorch\.distributed\.processes\.Shared"),
-    # what the engine's own functions hand each other
+    # what functions of the package hand each other
+    ("py:class", r"lfrtorch\.data\.dataset\.Undecided"),
     ("py:class", r"lfrtorch\.engine\..*\.(Layout|Matrices|Weights)"),
     ("py:class", r"lfrtorch\.maps\..*"),
 ]
