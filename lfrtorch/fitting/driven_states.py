@@ -56,6 +56,55 @@ def relaxation_frequencies(
     return 0.5 * _edge(inputs) * 100.0 ** -((np.arange(count) + 0.5) / count)
 
 
+def frequencies(
+    model: Model, records: Sequence[Record], relaxations: int, modes: int
+) -> tuple[Float[Array, " r"], Float[Array, " m"]]:
+    """Corner frequencies of relaxations, and natural ones of modes, rad per sample."""
+    inputs = [record.u for record in records]
+    corners = relaxation_frequencies(inputs, relaxations)
+    if not modes:
+        return corners, corners[:0]
+    errors = [record.errors(model.simulate(record)) / model.scaler.y_scale for record in records]
+    return corners, distortion_frequencies(inputs, errors, modes)
+
+
+@torch.no_grad()
+def begin_driven(
+    cell: LFRCell,
+    relaxations: Float[Array, " r"],
+    modes: Float[Array, " m"],
+    generator: torch.Generator,
+    *,
+    z: slice = slice(None),
+    w: slice = slice(None),
+) -> None:
+    """Begin the last states of a cell as driven ones of these frequencies, in place.
+
+    Their entries of Bw and Cy are random; those of Bu are 0, so that they are at rest as long as w
+    is 0. z sees the relaxations, a state each, and not the modes, two states each. Frequencies are
+    in rad per sample; ``z`` and ``w`` say which of them see and drive these states. Entries that
+    are held stay.
+    """
+    before = {name: cell.get_parameter(name).clone() for name in cell.held}
+    decay = np.exp(-np.concatenate([relaxations, np.repeat(_DAMPING * modes, 2)]))
+    first, A = cell.nx - len(decay), np.diag(decay)
+    for i, angle in enumerate(np.sqrt(1.0 - _DAMPING**2) * modes):
+        at = slice(len(relaxations) + 2 * i, len(relaxations) + 2 * i + 2)
+        A[at, at] @= [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    cell.A[first:, first:] = torch.as_tensor(A)
+    cell.Bu[first:] = 0.0
+    cell.Cz[z, first:] = 0.0
+    # White w of unit variance makes for states of about that.
+    gain = torch.as_tensor(np.sqrt(1.0 - decay**2)).to(cell.A)
+    seen = slice(first, first + len(relaxations))
+    for entries in (cell.Bw[first:, w], cell.Cy[:, first:], cell.Cz[z, seen]):
+        entries.uniform_(-0.3, 0.3, generator=generator)
+    cell.Bw[first:, w] *= gain[:, None]
+    for name, mask in cell.held.items():
+        entries = cell.get_parameter(name)
+        entries.copy_(torch.where(mask.to(entries.device), before[name], entries))
+
+
 def with_driven_states(
     model: Model,
     records: Sequence[Record],
@@ -66,14 +115,9 @@ def with_driven_states(
     """A model with the same output, and states beside its own that w alone drives."""
     if not relaxations + modes:
         return model
-    inputs = [record.u for record in records]
-    corners = relaxation_frequencies(inputs, relaxations)
-    natural = corners[:0]
-    if modes:
-        scale = model.scaler.y_scale
-        errors = [record.errors(model.simulate(record)) / scale for record in records]
-        natural = distortion_frequencies(inputs, errors, modes)
-    cell = _larger(model.lfr.cell, corners, natural, generator)
+    found = frequencies(model, records, relaxations, modes)
+    cell = _larger(model.lfr.cell, relaxations + 2 * modes)
+    begin_driven(cell, *found, generator)
     K = model.K
     if K is not None:
         K = torch.cat([K, K.new_zeros(cell.nx - len(K), cell.ny)])
@@ -81,38 +125,18 @@ def with_driven_states(
 
 
 @torch.no_grad()
-def _larger(
-    cell: LFRCell,
-    relaxations: Float[Array, " r"],
-    modes: Float[Array, " m"],
-    generator: torch.Generator,
-) -> LFRCell:
-    """The cell with driven states of these frequencies."""
-    # Their entries of Bw and Cy are random; those of Bu are 0, so that they are at rest as long as
-    # w is 0. z sees the relaxations, a state each, and not the modes, two states each. Frequencies
-    # are in rad per sample.
+def _larger(cell: LFRCell, states: int) -> LFRCell:
+    """The cell with more states, whose entries are 0."""
     like = {"dtype": cell.A.dtype, "device": cell.A.device}
-    decay = np.exp(-np.concatenate([relaxations, np.repeat(_DAMPING * modes, 2)]))
-    nx, states = cell.nx, len(decay)
     larger = LFRCell(
-        cell.nu, cell.ny, nx + states, cell.nz, cell.nw, deepcopy(cell.static), **like, random=False
-    )
+        cell.nu, cell.ny, cell.nx + states, cell.nz, cell.nw, deepcopy(cell.static),
+        **like, random=False,
+    )  # fmt: skip
     for name in ("A", "Bu", "Bw", "Cy", "Cz"):
         entries, own = larger.get_parameter(name).zero_(), cell.get_parameter(name)
         entries[: len(own), : own.shape[1]] = own
     for name in ("Dyu", "Dyw", "Dzu"):
         larger.get_parameter(name).copy_(cell.get_parameter(name))
-    A = np.diag(decay)
-    for i, angle in enumerate(np.sqrt(1.0 - _DAMPING**2) * modes):
-        at = slice(len(relaxations) + 2 * i, len(relaxations) + 2 * i + 2)
-        A[at, at] @= [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
-    larger.A[nx:, nx:] = torch.as_tensor(A)
-    # White w of unit variance makes for states of about that.
-    gain = torch.as_tensor(np.sqrt(1.0 - decay**2)).to(**like)
-    seen = slice(nx, nx + len(relaxations))
-    for entries in (larger.Bw[nx:], larger.Cy[:, nx:], larger.Cz[:, seen]):
-        entries.uniform_(-0.3, 0.3, generator=generator)
-    larger.Bw[nx:] *= gain[:, None]
     for name, mask in cell.held.items():
         beside = [n - m for n, m in zip(larger.get_parameter(name).shape, mask.shape, strict=True)]
         larger.held[name] = pad(mask, (0, beside[-1], 0, beside[0]) if mask.ndim == 2 else (0, 0))

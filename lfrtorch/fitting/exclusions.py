@@ -52,8 +52,6 @@ EXCLUSIONS = (
     Exclusion("structure", "z_feedthrough", "its z is of the inputs alone", ("hammerstein",)),
     Exclusion("known", "guarantee", "nothing is proven of a known model"),
     Exclusion("known", "structure", "its matrices are given"),
-    Exclusion("known", "relaxations", "nx is the number of states beside its own"),
-    Exclusion("known", "modes", "nx is the number of states beside its own"),
     Exclusion("known", "average", "a mean of models has no parameters of its own"),
     Exclusion("known", "fixed", "its matrices are given"),
     Exclusion("known", "init_from", "the model brings what is known of it"),

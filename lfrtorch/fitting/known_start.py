@@ -23,7 +23,7 @@ from lfrtorch.data.records import Record, Scaler, common_unit, rms_scale
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.held import no_feedthrough
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.fitting.driven_states import relaxation_frequencies
+from lfrtorch.fitting.driven_states import begin_driven, frequencies, relaxation_frequencies
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.prediction import without_innovations
 from lfrtorch.fitting.settings import Settings
@@ -131,7 +131,8 @@ def with_learned(model: Model, records: Sequence[Record], settings: Settings, se
     known, nx, states = cast(Known, settings.known), old.nx, cast(int, settings.nx)
     generator = torch.Generator().manual_seed(seed)
     learned = learned_map(settings, generator)
-    cell = around(static, known, old.nu, old.ny, learned=learned, states=states)
+    driven = settings.relaxations + 2 * settings.modes
+    cell = around(static, known, old.nu, old.ny, learned=learned, states=states + driven)
     cell.hold(no_feedthrough(cell, z=settings.z_feedthrough, y=settings.feedthrough))
 
     def uniform(name: str, part: Any, limit: float = 1.0) -> None:
@@ -147,11 +148,12 @@ def with_learned(model: Model, records: Sequence[Record], settings: Settings, se
         if states:
             corners = relaxation_frequencies([record.u for record in records], states)
             decay = torch.as_tensor(np.exp(-corners))
-            cell.A[nx:, nx:] = torch.diag(decay)
-            uniform("Bu", slice(nx, None))
-            cell.Bu[nx:] *= (1.0 - decay.square()).sqrt()[:, None]
+            linear = slice(nx, nx + states)
+            cell.A[linear, linear] = torch.diag(decay)
+            uniform("Bu", linear)
+            cell.Bu[linear] *= (1.0 - decay.square()).sqrt()[:, None]
+        own_z, own_w = slice(static.nz, None), slice(static.nw, None)
         if learned is not None:
-            own_z, own_w = slice(static.nz, None), slice(static.nw, None)
             uniform("Cz", own_z)
             uniform("Dzu", own_z)
             z = x @ cell.Cz[own_z, :nx].mT + u @ cell.Dzu[own_z].mT
@@ -163,7 +165,10 @@ def with_learned(model: Model, records: Sequence[Record], settings: Settings, se
                 uniform("Bw", (slice(None), own_w), _REACH)
                 uniform("Dyw", (slice(None), own_w), _REACH)
                 learned.zero_output()
-    K = None if model.K is None else pad(model.K, (0, 0, 0, states))
+        if driven:
+            bands = frequencies(model, records, settings.relaxations, settings.modes)
+            begin_driven(cell, *bands, generator, z=own_z, w=own_w)
+    K = None if model.K is None else pad(model.K, (0, 0, 0, states + driven))
     return replace(model, lfr=LFR(cell), K=K)
 
 

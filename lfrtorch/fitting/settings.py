@@ -172,6 +172,12 @@ class Settings(PlainSettings):
         """Refuse what is not for a known model."""
         integer("nx", self.nx, 0)
         integer("nn", self.nn, 0)
+        driven = self.relaxations + 2 * self.modes
+        if driven and self.static == "network" and not self.nn:
+            raise InputError(
+                f"relaxations is {self.relaxations} and modes is {self.modes}, and nothing beside "
+                "the known model has a w that drives their states; give nn=6, for example."
+            )
 
     def _check_sizes(self) -> None:
         known = isinstance(self.static, str) and self.static in LAST_SIZE

@@ -20,10 +20,11 @@ FREE = float("nan")
 SEARCH = LevenbergMarquardt(max_iter=6)
 
 
-def saturating(integrates: bool = False) -> Record:
+def saturating(integrates: bool = False, smooth: int = 1) -> Record:
     """A first-order lag with a saturated input, noise on its state and, if asked, an integrator."""
     random = np.random.default_rng(0)
     u, noise = random.standard_normal((2, 400))
+    u = np.convolve(u, np.hanning(smooth + 2), "same")
     x, s, y = np.zeros(2), 0.0, np.zeros(400)
     for k in range(400):
         y[k] = s if integrates else x[0] + 0.5 * x[1]
@@ -281,6 +282,35 @@ def test_what_stands_beside_known_equations(options: dict[str, Any]):
     if "z_feedthrough" in options:
         assert not cell.Dzu[2:].any()
         assert cell.Dzu[1, 0].item() == 1.0
+
+
+@pytest.mark.parametrize(("driven", "states"), [({"relaxations": 2}, 2), ({"modes": 1}, 2)])
+@pytest.mark.parametrize("acts_on", [["h"], ["y"], ["h", "y"]], ids=str)
+def test_states_that_w_alone_drives_beside_known_equations(
+    driven: dict[str, int], states: int, acts_on: list[str]
+):
+    """They begin at rest and reach only what the learned part may act on."""
+    known = lfrtorch.Known(
+        lag, states=["h"], parameters={"a": 0.6}, method="discrete", acts_on=acts_on
+    )
+    run = identified(saturating(smooth=12), known=known, nx=1, nn=3, **driven)
+    assert run.fit.history[-1].train < run.fit.history[0].train
+    cell = run.model.lfr.cell
+    assert cell.nx == 1 + 1 + states
+    assert cell.Cz[0].tolist() == [1.0] + [0.0] * (1 + states)  # the equations see their state
+    assert not cell.Bw[2:, 0].any()  # and drive no other
+    assert not cell.Cz[1].any()
+    assert cell.Bw[2:, 1:].any()
+    assert bool(cell.Cy[:, 2:].any()) == ("y" in acts_on)
+    assert bool(cell.A[0, 2:].any()) == ("h" in acts_on)
+    if "relaxations" in driven:
+        assert cell.Cz[2:, 2:].any()
+
+
+def test_driven_states_need_a_learned_map():
+    known = lfrtorch.Known(lag, states=["h"], parameters={"a": 0.6}, method="discrete")
+    with pytest.raises(InputError, match="has a w that drives their states; give nn=6"):
+        Settings(known=known, nn=0, relaxations=1)
 
 
 def test_a_frozen_matrix_stays_so_in_predictions_and_means():
