@@ -43,6 +43,8 @@ from cosmic_ray.operators.operator import Operator
 ROOT = Path(__file__).resolve().parents[1]
 
 NAMED: dict[str, str] = {
+    "fitting/windows": "fitting/windows fitting/from_outputs",
+    "fitting/folds": "fitting/folds fitting/from_outputs",
     "data/records": "data/records stream",
     "data/paired_blocks": "data/paired_blocks",
     "engine/held": "engine/held engine/integrators model/model fitting/held_pairs",
