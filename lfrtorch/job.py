@@ -76,10 +76,8 @@ def identify(
         >>> score["rmse"] < score["lti_rmse"]
         True
     """
-    dataset = _by_use(dataset)
-    if dataset.undecided:
-        dataset = decided(dataset)
     with using(ranks) as processes:
+        dataset = decided(_by_use(dataset))
         if observer is None:
             observer = LineObserver() if processes.rank == 0 else Observer()
         job = Job(

@@ -1,36 +1,10 @@
-"""Coordinates of a linear model: balanced ones, and any others."""
+"""Balanced coordinates of a linear model."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import scipy
-from jaxtyping import Float
 
 from lfrtorch._support.types import Array
-
-
-def in_coordinates(
-    model: Any, T: Float[Array, "nx nx"], inverse: Array | None = None
-) -> dict[str, Array | None]:
-    """Arrays of a linear model in the coordinates T x, by name."""
-    back = np.asarray(np.linalg.inv(T) if inverse is None else inverse, dtype=np.float64)
-    covariance, P = model.covariance, model.state_covariance
-    if covariance is not None:
-        nu, ny = np.eye(len(model.inputs)), np.eye(len(model.outputs))
-        blocks = np.kron(T, back.T), np.kron(T, nu), np.kron(ny, back.T), np.kron(ny, nu)
-        change = scipy.linalg.block_diag(*blocks)
-        covariance = change @ covariance @ change.T
-    return dict(
-        A=T @ model.A @ back,
-        B=T @ model.B,
-        C=model.C @ back,
-        K=None if model.K is None else T @ model.K,
-        covariance=covariance,
-        state_covariance=None if P is None else T @ P @ T.T,
-        x_offset=None if model.x_offset is None else T @ model.x_offset,
-    )
 
 
 def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:

@@ -108,6 +108,8 @@ def try_starts(record: Record) -> StartTrial:
 
 def decided(dataset: Dataset) -> Dataset:
     """Begin training records at rest that are undecided and clearly better so; notes say it."""
+    if not dataset.undecided:
+        return dataset
     open_, resting, notes = dataset.undecided, [], []
     for one in open_[:_TRIED]:
         name = f"{one.record.name}: " if len(dataset.train) > 1 else ""
