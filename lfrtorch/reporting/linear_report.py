@@ -53,7 +53,7 @@ def numbers(evaluation: Evaluation, frf: FRF | None, scan: OrderScan | None) -> 
             "seconds": fit.seconds,
         },
         "scores": scores,
-        "verdict": judge_linear(evaluation.simulations),
+        "verdict": judge_linear(evaluation.simulations)._asdict(),
         "poles": frequency_and_damping(model.poles, model.fs),
         "zeros": {
             name: frequency_and_damping(z, model.fs)

@@ -124,7 +124,7 @@ class Run:
             "seed": dataset.seed,
         }
         entries |= {
-            "verdict": asdict(self.verdict),
+            "verdict": self.verdict.entry(),
             "used": self.settings.used,
             "sizes_search": [] if self.choice is None else self.choice.entries(),
             "fit": {

@@ -81,40 +81,7 @@ class Kind(StrEnum):
     """Nothing was held out that moves: the training error is known, or the gain."""
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """Comparison of the NL-LFR with the linear model."""
-
-    kind: Kind  # what it comes to
-    text: str  # in a sentence of 160 characters at most
-    use: str  # "NL-LFR", "linear model" or "neither"
-    # The NL-LFR's error over the linear model's (ratio, ratio_std), both errors over the output's
-    # standard deviation (nrmse, linear_nrmse), and the same of each record in records.
-    evidence: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def colour(self) -> str:
-        """``"red"`` if bad, ``"amber"`` if linear, ``"green"`` if better, ``"grey"`` if unknown."""
-        if self.use == NEITHER or self.kind in (Kind.WORSE, Kind.DIVERGES):
-            return "red"
-        return {Kind.BETTER: "green", Kind.LINEAR: "amber"}.get(self.kind, "grey")
-
-    def __str__(self) -> str:
-        return self.text
-
-
-class Refusal(NamedTuple):
-    """A reason not to call an NL-LFR better whose error is smaller."""
-
-    text: str  # in a sentence after "the error is 67 % of its, but", in 42 characters at most
-    kind: Kind = Kind.WORSE  # what the verdict comes to
-
-
-REMEMBERS = Refusal("it does not forget where it began", Kind.LINEAR)
-"""Refusal of a model whose output depends for ever on its start, unlike the records."""
-
-
-class _Compared(NamedTuple):
+class Comparison(NamedTuple):
     """The NL-LFR beside the linear model on one record or several, each output counting alike."""
 
     name: str  # in a sentence, such as "test 'sweep'"
@@ -153,6 +120,63 @@ class _Compared(NamedTuple):
         """The ratio to speak of: that of the blocks if a runaway hides it."""
         return self.middle if self.hidden else self.ratio
 
+    def entry(self) -> dict[str, Any]:
+        """For ``metrics.json``."""
+        numbers = self._asdict()
+        return {"on": numbers.pop("name"), **numbers}
+
+
+@dataclass(frozen=True)
+class Comparisons:
+    """What a verdict rests on."""
+
+    whole: Comparison | None = None  # all records that judge
+    records: Sequence[Comparison] = ()  # each that was not fitted
+    diverges: Sequence[str] = ()  # records on which the NL-LFR runs away
+    ahead: Mapping[int, Comparisons] = field(default_factory=dict)  # of predictions farther ahead
+
+    def entry(self) -> dict[str, Any]:
+        """For ``metrics.json``."""
+        found: dict[str, Any] = {} if self.whole is None else self.whole.entry()
+        found |= {"records": [c.entry() for c in self.records], "diverges": [*self.diverges]}
+        ahead = {str(ahead): other.entry() for ahead, other in self.ahead.items()}
+        return found | ({"ahead": ahead} if ahead else {})
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Comparison of the NL-LFR with the linear model."""
+
+    kind: Kind  # what it comes to
+    text: str  # in a sentence of 160 characters at most
+    use: str  # "NL-LFR", "linear model" or "neither"
+    evidence: Comparisons = field(default_factory=Comparisons)
+
+    @property
+    def colour(self) -> str:
+        """``"red"`` if bad, ``"amber"`` if linear, ``"green"`` if better, ``"grey"`` if unknown."""
+        if self.use == NEITHER or self.kind in (Kind.WORSE, Kind.DIVERGES):
+            return "red"
+        return {Kind.BETTER: "green", Kind.LINEAR: "amber"}.get(self.kind, "grey")
+
+    def __str__(self) -> str:
+        return self.text
+
+    def entry(self) -> dict[str, Any]:
+        """For ``metrics.json``."""
+        return {**vars(self), "evidence": self.evidence.entry()}
+
+
+class Refusal(NamedTuple):
+    """A reason not to call an NL-LFR better whose error is smaller."""
+
+    text: str  # in a sentence after "the error is 67 % of its, but", in 42 characters at most
+    kind: Kind = Kind.WORSE  # what the verdict comes to
+
+
+REMEMBERS = Refusal("it does not forget where it began", Kind.LINEAR)
+"""Refusal of a model whose output depends for ever on its start, unlike the records."""
+
 
 class _Errors(NamedTuple):
     """Relative squared errors of a record, summed over each block of time (B,)."""
@@ -170,8 +194,8 @@ class _Case(NamedTuple):
 
     result: FitResult
     lost: Sequence[Response]  # on which the NL-LFR diverges
-    whole: _Compared | None  # on all records that judge
-    worst: _Compared | None  # on the record where it is clearly worse
+    whole: Comparison | None  # on all records that judge
+    worst: Comparison | None  # on the record where it is clearly worse
     held_out: bool  # whether the records that judge were not fitted
     settled: str  # tests that have settled, in words, if others judge or none does
     moves: bool  # whether the records that judge do
@@ -214,8 +238,7 @@ def judge(
     if cross := [e for e in held_out if _is_cross(e.response)]:
         every.append(_compared(cross))
     whole = _compared(judged or errors) if errors else None
-    evidence = {} if whole is None else _numbers(whole)
-    evidence |= {"records": [_numbers(c) for c in every], "diverges": [_name(r) for r in lost]}
+    evidence = Comparisons(whole, every, [_name(r) for r in lost])
     case = _Case(
         result=result,
         lost=lost,
@@ -279,7 +302,7 @@ def _unjudged(c: _Case) -> _Found | None:
     return None
 
 
-def _judged(c: _Case, whole: _Compared) -> _Found:
+def _judged(c: _Case, whole: Comparison) -> _Found:
     """A comparison on what was held out."""
     told = f"{percent(whole.told)} of its"
     on = f"on {whole.name} the"
@@ -328,43 +351,57 @@ def judge_predictions(
         error="prediction error",
         refusals=refusals,
     )
-    seen = {"ahead": {str(ahead): other.evidence for ahead, other in farther.items()}}
-    found = replace(first, evidence={**first.evidence, **seen})
+    seen = {ahead: other.evidence for ahead, other in farther.items()}
+    found = replace(first, evidence=replace(first.evidence, ahead=seen))
     if first.use == NEITHER or first.kind not in (Kind.BETTER, Kind.LINEAR) or refusals:
         return found
+    whole = first.evidence.whole
+    assert whole is not None
     better = [each for each in farther.values() if each.kind == Kind.BETTER and each.use == NL_LFR]
     if first.kind == Kind.BETTER:
-        ratios = [e.evidence["ratio"] for e in (first, *farther.values()) if "ratio" in e.evidence]
+        every = [whole, *(e.evidence.whole for e in farther.values())]
+        ratios = [each.ratio for each in every if each is not None]
         listed = " and ".join(", ".join(f"{number(100 * r)}" for r in ratios).rsplit(", ", 1))
         which = " and ".join(", ".join(map(str, views)).rsplit(", ", 1))
         text = (
-            f"Better than the linear model (nx {linear_nx}): on {first.evidence['on']} the "
+            f"Better than the linear model (nx {linear_nx}): on {whole.name} the "
             f"errors {which} samples ahead are {listed} % of its."
         )
         return replace(found, text=text)
     if not better:
         return found
-    text = f"{better[0].text[:-1]}, {percent(first.evidence['ratio'])} one ahead."
+    text = f"{better[0].text[:-1]}, {percent(whole.ratio)} one ahead."
     return replace(better[0], text=text, evidence=found.evidence)
 
 
 def _farther(ahead: int, verdict: Verdict) -> Refusal | None:
     """Return what a verdict farther ahead refuses; None where neither model foresees anything."""
-    ratio = verdict.evidence.get("ratio", math.inf)
+    whole = verdict.evidence.whole
+    ratio = math.inf if whole is None else whole.ratio
     worse = verdict.kind == Kind.WORSE and (verdict.use != NEITHER or ratio >= _CLEAR)
     if verdict.kind == Kind.DIVERGES:
         return Refusal(f"it diverges {ahead} samples ahead", Kind.DIVERGES)
     return Refusal(f"{number(ratio)} times as large {ahead} samples ahead") if worse else None
 
 
-def judge_linear(responses: Sequence[Response]) -> dict[str, Any]:
+class LinearVerdict(NamedTuple):
+    """Judgement of a linear model alone."""
+
+    usable: bool | None  # None if nothing is scored
+    text: str
+    on: str | None = None  # the use of the records that judge
+    output: str | None = None  # the worst one
+    nrmse: float | None = None  # its error over its standard deviation
+
+
+def judge_linear(responses: Sequence[Response]) -> LinearVerdict:
     """Judge a linear model by its worst output on the tests, else validation, else training."""
     uses = "test", "validation", "train"
     parts = {use: [r for r in responses if r.use == use] for use in uses}
     errors = {use: _relative_errors(part, responses) for use, part in parts.items()}
     judged = next((use for use, found in errors.items() if found), None)
     if judged is None:
-        return {"usable": None, "text": "Not judged: nothing is scored."}
+        return LinearVerdict(None, "Not judged: nothing is scored.")
     name, error = max(errors[judged].items(), key=lambda item: item[1])
     usable = error < EXPLAINS_NOTHING
     output = "the output" if len(errors[judged]) == 1 else f"'{name}'"
@@ -381,13 +418,7 @@ def judge_linear(responses: Sequence[Response]) -> dict[str, Any]:
     deviations = training_deviations(responses)
     if usable and judged != "train" and all(has_settled(r, deviations) for r in parts[judged]):
         text += f"; {where} has settled and tells the gain alone"
-    return {
-        "usable": usable,
-        "text": f"{text[0].upper()}{text[1:]}.",
-        "on": judged,
-        "output": name,
-        "nrmse": error,
-    }
+    return LinearVerdict(usable, f"{text[0].upper()}{text[1:]}.", judged, name, error)
 
 
 def _relative_errors(part: Sequence[Response], every: Sequence[Response]) -> dict[str, float]:
@@ -444,7 +475,7 @@ def _errors(responses: Sequence[Response], every: Sequence[Response]) -> list[_E
 def _compared(
     errors: Sequence[_Errors],
     among: int = 1,  # records that are compared one by one
-) -> _Compared:
+) -> Comparison:
     """Both models on some records, each relative to the linear model's error there."""
     counts = np.concatenate([e.counts for e in errors])
     samples = np.array([e.counts.sum() for e in errors])
@@ -463,7 +494,7 @@ def _compared(
     cross = all(_is_cross(e.response) for e in errors)
     middle, far = beside.middle(_MOST, _LEAST_ERROR)
     clear = stdtrit(len(counts) - 1, 1.0 - (1.0 - CONFIDENCE) / max(1, among))
-    return _Compared(
+    return Comparison(
         name=_name(first) if len(errors) == 1 else several,
         ratio=ratio,
         ratio_std=ratio_std,
@@ -481,12 +512,6 @@ def _compared(
 def _is_cross(response: Response) -> bool:
     """Tell whether it is of cross-validation, each stretch by other models."""
     return response.record.name.endswith(CROSS)
-
-
-def _numbers(compared: _Compared) -> dict[str, Any]:
-    """As ``metrics.json`` has it."""
-    numbers = compared._asdict()
-    return {"on": numbers.pop("name"), **numbers}
 
 
 def _use(response: Response) -> str:

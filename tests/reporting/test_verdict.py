@@ -15,7 +15,7 @@ from lfrtorch.data.records import Record
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.reporting import verdict
 from lfrtorch.reporting.evaluation import CROSS, Response
-from lfrtorch.reporting.verdict import Kind, Verdict
+from lfrtorch.reporting.verdict import Comparison, Kind, Verdict
 
 judge = partial(verdict.judge, linear_nx=2)
 judge_predictions = partial(verdict.judge_predictions, linear_nx=2)
@@ -43,6 +43,11 @@ def cut(whole: Response, samples: int) -> Response:
     """The beginning of a record with its simulations."""
     simulated = {name: y[:samples] for name, y in whole.simulated.items()}
     return Response(whole.record[:samples], whole.use, simulated)
+
+
+def compared(found: Verdict) -> Comparison:
+    assert found.evidence.whole is not None
+    return found.evidence.whole
 
 
 TRAIN = response("train", 0.2)
@@ -122,7 +127,7 @@ def test_one_poor_stretch_does_not_decide_in_cross_validation(
 def test_a_verdict_that_a_runaway_hides_speaks_of_most_blocks():
     part = np.where(np.arange(1000) // 100 == 4, 30.0, 0.4)
     found = judge(result(), [TRAIN, response("validation", part, name=CROSS)])
-    assert found.evidence["ratio"] > 1.0
+    assert compared(found).ratio > 1.0
     assert "on cross-validation the NL-LFR's error is in most blocks 5" in found.text
     alike = judge(result(), [TRAIN, response("validation", 0.4, name=CROSS)])
     assert "is 40.0 % of the linear model's" in alike.text
@@ -148,8 +153,10 @@ def test_the_standard_error_is_how_far_the_ratio_varies(part: float):
         shared, own = rng.standard_normal((2, 1000, 1))
         y = rng.standard_normal((1000, 1))
         parts = {"linear": y + shared, "NL-LFR": y + part * (0.8 * shared + 0.6 * own)}
-        found.append(judge(result(), [Response(Record(still, y), "test", parts)]).evidence)
-    ratios, errors = (np.array([each[key] for each in found]) for key in ("ratio", "ratio_std"))
+        found.append(compared(judge(result(), [Response(Record(still, y), "test", parts)])))
+    ratios, errors = (
+        np.array([getattr(each, key) for each in found]) for key in ("ratio", "ratio_std")
+    )
     # 200 draws tell a standard deviation to 5 %, and ten blocks have a bias of 3 %.
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(ratios.std(), rel=0.2)
 
@@ -164,7 +171,7 @@ def test_a_fit_that_kept_its_start_is_as_the_linear_model():
 def test_one_of_many_records_is_worse_by_chance():
     # Thirty comparisons at one in forty each: one would be called worse without a share of each.
     tests = [response("test", 0.0, noise=1.0, name="n" * k) for k in range(1, 31)]
-    assert max(judge(result(), [TRAIN, test]).evidence["deviations"] for test in tests) > 2.0
+    assert max(compared(judge(result(), [TRAIN, test])).deviations for test in tests) > 2.0
     assert judge(result(), [TRAIN, *tests]).kind == Kind.LINEAR
 
 
@@ -258,7 +265,7 @@ def test_errors_are_relative_to_what_all_records_do():
     moved = Response(Record(u, quiet.record.y, name="test"), "test", quiet.simulated)
     found = judge(result(), [TRAIN, moved])
     assert (found.kind, found.use) == ("linear", "linear model")
-    assert found.evidence["linear_nrmse"] == pytest.approx(0.01, rel=0.1)
+    assert compared(found).linear_nrmse == pytest.approx(0.01, rel=0.1)
 
 
 def test_an_opponent_that_is_worse_than_a_constant_is_called_so():
@@ -298,25 +305,25 @@ def test_a_verdict_is_one_line(part: float, linear: float, use: str):
 def test_a_linear_model_that_explains_nothing_is_called_so():
     good, bad = response("test", 0.0, linear=0.25), response("test", 0.0, linear=2.5)
     judged = verdict.judge_linear([TRAIN, good])
-    assert judged["text"] == (
-        f"On test the linear model's error is {100 * judged['nrmse']:.1f} % of the standard "
+    assert judged.nrmse == pytest.approx(0.25, rel=0.1)
+    assert judged.text == (
+        f"On test the linear model's error is {100 * (judged.nrmse or 0.0):.1f} % of the standard "
         "deviation of the output."
     )
-    assert judged["nrmse"] == pytest.approx(0.25, rel=0.1)
     found = verdict.judge_linear([TRAIN, response("validation", 0.0), bad])
-    assert not found["usable"]
-    assert found["text"].startswith("Not usable: on test ")
-    assert "of the output, worse than a constant (in training 1" in found["text"]
-    assert verdict.judge_linear([TRAIN])["on"] == "train"
+    assert not found.usable
+    assert found.text.startswith("Not usable: on test ")
+    assert "of the output, worse than a constant (in training 1" in found.text
+    assert verdict.judge_linear([TRAIN]).on == "train"
     lost = Response(good.record, "test", {"linear": np.full((1000, 1), np.nan)})
-    assert not verdict.judge_linear([TRAIN, lost])["usable"]
+    assert not verdict.judge_linear([TRAIN, lost]).usable
     rest = np.zeros((1000, 1))
     still = Response(Record(rest, rest, name="rest"), "test", {"linear": rest})
-    assert verdict.judge_linear([still])["usable"] is None
+    assert verdict.judge_linear([still]).usable is None
 
 
 def test_a_linear_model_of_a_step_is_usable():
     found = verdict.judge_linear([TRAIN, settled("test", 1.0)])
-    assert found["usable"]
-    assert found["nrmse"] == pytest.approx(0.01, rel=0.1)
-    assert found["text"].endswith("; test has settled and tells the gain alone.")
+    assert found.usable
+    assert found.nrmse == pytest.approx(0.01, rel=0.1)
+    assert found.text.endswith("; test has settled and tells the gain alone.")
