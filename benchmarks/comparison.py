@@ -4,11 +4,11 @@
 
 ``--root`` holds the official files, ``--wild`` two_tanks/train.csv and mr_damper/train.csv
 (MATLAB's twotankdata at 5 Hz and mrdamper at 200 Hz, 2000 samples each, columns of u and y),
-``--peers`` is a virtual environment with freq-statespace, jax-sysid, sysidentpy, tsfast, neural-ssm
-and h5py (comparison.md has the versions). Every script in contestants/ is what a user
-types. Each system is one record for estimation, by the board's own split, of which the last quarter
-is new: the scripts get the first three quarters, simulate the input of all four from the first
-sample on, and are scored on the last. No test record is read. Results are kept after each run in
+``--peers`` holds a virtual environment for each of freq_statespace, jax_sysid, sysidentpy, tsfast
+and neural_ssm (comparison.md has the versions). Every script in contestants/ is what a user types.
+Each system is one record for estimation, by the board's own split, of which the last quarter is
+new: the scripts get the first three quarters, simulate the input of all four from the first sample
+on, and are scored on the last. No test record is read. Results are kept after each run in
 comparison.json, and a second call does those that are missing; without any, it prints the table.
 """
 
@@ -85,7 +85,8 @@ def run(name: str, script: str, options: argparse.Namespace) -> dict[str, Any]:
     cut = 3 * len(u) // 4
     python = Path(sys.executable)
     if not script.startswith("lfrtorch"):
-        python = options.peers / "bin" / "python"
+        package = script.rpartition("_")[0]
+        python = options.peers.resolve() / package / "bin" / "python"
     with tempfile.TemporaryDirectory() as folder:
         data, out = Path(folder, "given.npz"), Path(folder, "simulated.npy")
         np.savez(data, u=u[:cut], y=y[:cut], every_u=u, order=order, **given)

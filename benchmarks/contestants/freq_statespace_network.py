@@ -11,7 +11,7 @@ if period:  # realisations of one multisine, odd lines
     lines = np.arange(1, 2 * 1342, 2)
 else:  # it asks for periods: all of the record is one
     u4, y4, lines = u[:, :, None, None], y[:, :, None, None], np.arange(1, len(u) // 2)
-data = fss.create_data_object(u4, y4, lines, fs)
+data = fss.create_data_object(u4, y4, fs, lines)
 bla = fss.lin.optimize(fss.lin.subspace_id(data, order), data)
 network = fss.static.NeuralNetwork(1, 1, layers=1, neurons_per_layer=10, activation=jax.nn.relu)
 start = fss.nonlin.connect(bla, network)

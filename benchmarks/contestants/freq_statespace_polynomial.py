@@ -10,7 +10,7 @@ if period:  # realisations of one multisine, odd lines
     lines = np.arange(1, 2 * 1342, 2)
 else:  # it asks for periods: all of the record is one
     u4, y4, lines = u[:, :, None, None], y[:, :, None, None], np.arange(1, len(u) // 2)
-data = fss.create_data_object(u4, y4, lines, fs)
+data = fss.create_data_object(u4, y4, fs, lines)
 bla = fss.lin.optimize(fss.lin.subspace_id(data, order), data)
 phi = fss.static.basis.Polynomial(1, degree=3)
 start = fss.nonlin.inference_and_learning(bla, data, phi, 1)
