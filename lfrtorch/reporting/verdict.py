@@ -128,7 +128,7 @@ class Comparison(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparisons:
-    """What a verdict rests on."""
+    """The comparisons behind a verdict."""
 
     whole: Comparison | None = None  # all records that judge
     records: Sequence[Comparison] = ()  # each that was not fitted
