@@ -10,7 +10,7 @@ from lfrtorch._support.types import Array
 def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
     """Return T and T⁻¹ to balanced coordinates, by the square-root method (Laub et al. 1987).
 
-    An unstable system has none, and keeps its own.
+    For an unstable system, which has no balanced coordinates, both are the identity.
     """
     controllable, observable = _gramian(A, B @ B.T), _gramian(A.T, C.T @ C)
     if controllable is None or observable is None:
@@ -25,7 +25,7 @@ def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
 
 
 _DOUBLINGS = 60
-"""Poles nearer to the unit circle than rounding have not ended then."""
+"""Enough doublings for every pole to decay that rounding can tell from one on the unit circle."""
 
 
 def _gramian(A: Array, Q: Array) -> Array | None:

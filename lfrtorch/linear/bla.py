@@ -1,4 +1,4 @@
-"""Parametric best linear approximation (BLA): a linear state-space model of an order.
+"""Parametric best linear approximation (BLA): a linear state-space model of a given order.
 
 Records or a response become a least-squares problem in normalised units (``pose``), whose best
 minimum ``minima`` finds. The result is put into balanced coordinates and physical units, with its
@@ -67,10 +67,10 @@ from lfrtorch.model.model import state_moment
 
 Criterion = Literal["simulation", "prediction", "frequency"]
 
-_NEAR, _SETTLED = 12, 1e-4  # iterations from a model near the minimum, and what ends them
+_NEAR, _SETTLED = 12, 1e-4  # largest number of iterations, and the decrease that ends them
 
 FILTERS = 4
-"""Most filters that the error of a differenced output is whitened by."""
+"""At most so many models of a differenced output, each but the first with its own filter."""
 
 
 @typed()
@@ -90,41 +90,42 @@ def estimate_bla(
 
     Subspace methods estimate A and C, linear least squares B and D, and Levenberg-Marquardt refines
     the best of these models in the error of choice. Unstable poles of a subspace estimate are
-    reflected into the unit circle, and the refinement rejects every step to an unstable model. A
-    prediction alone finds an unstable one, of a system in a loop, if that predicts clearly better.
+    reflected into the unit circle, and the refinement rejects every step to an unstable model. Only
+    a prediction error can give an unstable model, for a system in a loop, if that model predicts
+    clearly better.
 
     - ``"simulation"``, the default for records in steady state or without a reference: simulated
-      minus measured output. For periodic records in steady state, also if that begins after the
-      skipped samples, it is computed from their spectra at the excited lines, at a fraction of the
-      work. A note names their band if a measured input has power elsewhere. Noise of the inputs,
-      which two periods tell, and what a controller feeds back to them leave no bias there. Poles
-      are kept from being narrower than the lines are apart, and than their distance from the band,
-      unless the data clearly ask for that.
+      minus measured output. For periodic records in steady state it is computed from their
+      spectra at the excited lines, at a fraction of the work; the steady state may begin after
+      the skipped samples. A note names the band of these lines if a measured input has power at
+      other lines. Given two periods or more, neither noise on the inputs nor its feedback by a
+      controller causes a bias. A resonance is kept wider than the spacing of the lines, and than
+      about its distance from the excited band, unless the data clearly ask for less.
     - ``"prediction"``: output predicted one sample ahead by an innovation model, more precise if
       disturbances act on the states. The gain K is part of the model. For records in steady state
       an initial state is estimated, as their noise does not repeat.
-    - ``"frequency"``, the default for a response and its only one, and that for other records with
-      a reference: the nonparametric response, weighted by its variance if wanted. ``estimate_frf``
-      turns records into a response.
+    - ``"frequency"``, the only criterion for a response, and the default for records with a
+      reference that are not in steady state: error from the nonparametric response, weighted by
+      its variance if wanted. ``estimate_frf`` turns records into a response.
 
     Args:
         data: records, or a nonparametric response. A given ``x0`` of a record is in the coordinates
             of another model, so that the initial state is estimated instead.
         nx: order.
         refine: the error. Default: see above.
-        weight: weight of a response's errors: one over its ``"total"`` or ``"noise"`` variance,
-            ``"none"``, or own weights. Default: none for periodic data, as that model simulates
-            best; the total variance for others, whose input has lines of little power; with
-            integrators the total or the noise variance if one is known.
+        weight: weights of a response's errors: ``"total"`` or ``"noise"`` for one over that
+            variance, ``"none"``, or an array. Default: none for periodic data, as that model
+            simulates best; the total variance for other data, whose inputs have little power at
+            some lines. With integrators: the total variance, else the noise variance, if known.
         offset: remove constants and store them as operating point.
         feedthrough: the input acts on the output at once; otherwise D is 0, as it must be
             for data under feedback, which a prediction fits without bias.
-        integrators: poles at z = 1 behind each output, exactly: 1 from a speed to a position, 2
-            from a force without friction; or a list with 0 or 1 for each output, ``[1, 0]`` for a
-            position and a speed. ``nx`` counts them. Then (z - 1)ⁿ G is fitted, in a
-            simulation error that is filtered so that it is about white, and D is 0 unless it lowers
-            the error by 1 %. Not for a prediction, and not for records in steady state: the system
-            has none of its own.
+        integrators: number of exact poles at z = 1 behind each output: 1 from a speed to a
+            position, 2 from a force to a position without friction. Or a list with 0 or 1 for each
+            output: ``[1, 0]`` for a position and a speed. ``nx`` includes these poles. The fit is
+            then to (z - 1)ⁿ G, by a simulation error filtered to be about white, and D is 0 unless
+            it lowers the error by 1 %. Not for a prediction, nor for records in steady state,
+            which an integrating system does not have.
         max_iter: iterations of the refinement; 0 keeps the best subspace estimate.
 
     Shape:
@@ -171,7 +172,7 @@ def estimate_bla(
         refine = refine or default_criterion(data)
     true_or_false("feedthrough", feedthrough)
     if refine != "frequency" and weight is not None:
-        raise InputError("weight is that of a response: use refine='frequency'.")
+        raise InputError("weight is for a response only: use refine='frequency'.")
     settings = Settings(refine, weight, offset, feedthrough, max_iter)
     estimate = partial(_integrating, counts=counts) if any(counts) else _stable
     model = estimate(data, nx, settings)
@@ -190,9 +191,9 @@ def estimate_bla(
 
 @spread_by_hand()
 def refined_near(model: LinearModel, records: Sequence[Record]) -> LinearModel:
-    """Fit a model's order to other records of its kind in simulation error, from that model."""
-    # That is all a fit without some of the samples takes. One with exact integrators is made anew,
-    # and another one that does not fade stays as it is.
+    """Fit a model of the same order to other records by simulation error, from the given model."""
+    # A refit without some of the samples needs no more. A model with exact integrators is
+    # estimated anew; any other model that is not asymptotically stable is returned as it is.
     data = [without_coordinates(record) for record in records]
     offset = bool(model.y_offset.any() or model.u_offset.any())
     if model.poles.size and np.abs(model.poles).max() >= 1.0:
@@ -223,7 +224,7 @@ def refined_near(model: LinearModel, records: Sequence[Record]) -> LinearModel:
 
 
 def _integrating_outputs(model: LinearModel) -> list[int]:
-    """Integrators behind each output, 0 or 1; zeros if a pole does not fade that is none."""
+    """Return the integrators behind each output, 0 or 1; zeros if another pole is not stable."""
     values, vectors = np.linalg.eig(model.A)
     exact = np.isclose(values, 1.0, rtol=0.0, atol=1e-12)
     if np.abs(values[~exact]).max(initial=0.0) >= 1.0:
@@ -233,7 +234,7 @@ def _integrating_outputs(model: LinearModel) -> list[int]:
 
 
 def default_criterion(records: Sequence[Record]) -> Criterion:
-    """Return the error that records are fitted by if none is asked for."""
+    """Return the criterion by which records are fitted by default."""
     return "frequency" if of_response(records) else "simulation"
 
 
@@ -260,8 +261,8 @@ class _Posed(NamedTuple):
 def pose(data: list[Record] | FRF, settings: Settings, direct: int = 0) -> _Posed:
     """Pose the problem of a criterion: on spectra where that is the same as on signals.
 
-    The last ``direct`` inputs act on the output alone; of a response they are differences of its
-    inputs, which it need not have.
+    The last ``direct`` inputs act on the output alone. For a response they are computed here, as
+    differences of its inputs.
     """
     refine, weight, offset, feedthrough, _ = settings
     records = [] if isinstance(data, FRF) else data
@@ -331,7 +332,7 @@ def _stable(
     if weighted and isinstance(weight, str | None) and found.rmse > 2.0:  # good fits reached 1.3
         cause = "nonlinear distortion or " if weight == "noise" else ""
         notes.append(
-            f"the error is {number(found.rmse)} times its {weight or 'total'} deviation: "
+            f"the error is {number(found.rmse)} times its {weight or 'total'} standard deviation: "
             f"{cause}too low an order."
         )
     if max_iter and found.iterations >= max_iter:
@@ -340,14 +341,14 @@ def _stable(
             f"use estimate_bla(max_iter={2 * max_iter})."
         )
     model = physical(found, scaler, about)
-    if np.abs(model.poles).max() < 1.0:  # states without a controller have no deviation
+    if np.abs(model.poles).max() < 1.0:  # the states of an unstable model have no finite variance
         model = model.transformed(*transformation(problem, found.matrices))
     rmse = found.rmse
     if found.constant is not None:
         model = replace(model, y_offset=model.y_offset + scaler.y_scale * found.constant)
     if records and refine != "prediction":
         errors = np.concatenate([r.errors(model.simulate(r)) for r in records])
-        if offset and found.constant is None:  # the fit to spectra has eliminated it
+        if offset and found.constant is None:  # the fit to spectra has eliminated the constant
             model = replace(model, y_offset=model.y_offset + errors.mean(axis=0))
             errors = errors - errors.mean(axis=0)
         if refine == "simulation":
@@ -443,7 +444,7 @@ def _fit(model: LinearModel) -> LinearFit:
 
 
 def _doubts(problem: Problem, estimate: SubspaceEstimate, found: Refined) -> list[str]:
-    """Say what the subspace and the poles tell of data and order."""
+    """Return notes on data and order from the subspace estimate and the poles."""
     nx, notes, s = len(found.A), [], estimate.singular_values
     carried = int((s > 1e-10).sum())
     if len(s) >= nx > carried:
@@ -476,8 +477,8 @@ def _doubts(problem: Problem, estimate: SubspaceEstimate, found: Refined) -> lis
         )
     elif slowest > 1.0 - 1e-4:
         notes.append(
-            f"the slowest pole has radius {radius(slowest)}: data that drift or integrate ask for "
-            "one, or an order above what they carry; look at the data, or lower nx."
+            f"the slowest pole has radius {radius(slowest)}: the data drift or integrate, or nx is "
+            "above the order that they carry; look at the data, or lower nx."
         )
     return notes
 

@@ -10,10 +10,10 @@ from lfrtorch.data.records import Channel
 
 
 def control_system(model: Any) -> Any:
-    """The deviations of a linear model from its operating point as a ``control.StateSpace``.
+    """Return the deviations of a linear model from its operating point as ``control.StateSpace``.
 
-    Dots in channel names, which that package does not allow, become underscores; of two names that
-    are the same then, the second one has one more.
+    Dots in channel names, which that package does not allow, become underscores. If two names
+    become the same, the second one gets another underscore.
 
     Raises:
         ValueError: the package ``control`` is not installed.
@@ -24,7 +24,7 @@ def control_system(model: Any) -> Any:
 
 
 def control_labels(channels: Sequence[Channel]) -> list[str]:
-    """Make labels of python-control from channel names: without dots, and each another one."""
+    """Make labels for python-control from channel names: without dots, and all different."""
     labels: list[str] = []
     for channel in channels:
         label = channel.name.replace(".", "_")

@@ -1,11 +1,11 @@
 """Nonparametric best linear approximation: frequency response, noise and nonlinear distortion.
 
-The best linear approximation (BLA) of a nonlinear system is the linear system whose output is
-nearest to its own, for inputs of one spectrum. The unexplained rest is of two kinds. Noise
-changes from period to period of the same input. Nonlinear distortion is the same in every period,
-but looks like noise over frequency and changes from one realisation of the input to the next. So
-periods and realisations together tell how much of an error is noise, and how much a nonlinear model
-can hope to explain.
+The best linear approximation (BLA) of a nonlinear system is the linear system with the nearest
+output, for inputs of one spectrum. The unexplained rest is of two kinds. Noise changes from
+period to period of the same input. Nonlinear distortion is the same in every period, but looks like
+noise over frequency and changes from one realisation of the input to the next. So periods and
+realisations together tell how much of an error is noise, and how much a nonlinear model can hope to
+explain.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Level:
     Args:
         frequencies: frequencies of the lines, Hz.
         power: power of the mean over the periods, as a mean over the records.
-        noise: the power that the disturbing noise is expected to have in it.
+        noise: expected power of the disturbing noise in ``power``.
     """
 
     frequencies: Float[Array, " F"]
@@ -66,7 +66,7 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Distortion:
-    """Nonlinear distortion at the output under an odd excitation, even and odd apart.
+    """Nonlinear distortion at the output under an odd excitation, separated into even and odd.
 
     Args:
         output: the output at the excited lines.
@@ -83,7 +83,7 @@ class FRF:
     """Best linear approximation at some frequencies, in physical units, with its covariances.
 
     The covariance at a line is E[d dᴴ] of the error d of vec(G) = ``G[f].reshape(-1)`` (output,
-    then input). It is that of the estimate, which is a mean over periods and experiments.
+    then input). G is a mean over periods and experiments, and the covariance is that of the mean.
 
     Args:
         frequencies: Hz.
@@ -93,13 +93,13 @@ class FRF:
         inputs, outputs: channel names and units.
         cov_noise: covariance due to the disturbing noise, ``None`` if not available.
         cov_total: covariance due to noise and stochastic nonlinear distortion together, likewise.
-        experiments: number of records, those of one realisation together.
-        periods: periods of the experiment with the fewest; 1 without periods.
+        experiments: number of records; records of one realisation count as one.
+        periods: smallest number of periods of an experiment; 1 for records without periods.
         method: ``"robust"``, ``"fast"`` or ``"local_polynomial"``.
         distortion: levels at the output, from the fast method alone.
         notes: results that are not available, with the reason and a remedy.
-        errors: map of the errors of local polynomials, whose windows share lines: these follow
-            from independent ones.
+        errors: map from independent errors to the errors of local polynomials, which are correlated
+            as their windows share lines.
 
     Example:
         >>> frf = lfrtorch.estimate_frf(record)
@@ -175,8 +175,8 @@ def estimate_frf(
     over the experiments (one input: the mean of their ratios weighted by input power). The
     scatter from period to period is noise; the scatter over experiments is noise and
     distortion. Experiments weigh equally, whatever their number of periods. The total covariance
-    comes from the scatter of the blocks of nu experiments if these are orthogonal multisines, and
-    else from the residuals, as if these had one covariance in all experiments.
+    comes from the scatter of the blocks of nu experiments if these are orthogonal multisines;
+    otherwise from the residuals, assumed to have the same covariance in all experiments.
 
     ``"fast"``: the same estimate from as little as one experiment, with a random odd multisine.
     At the odd lines that are not excited, the output minus the linear response is odd distortion
@@ -184,29 +184,29 @@ def estimate_frf(
     falls on even lines and does not disturb G.
 
     ``"local_polynomial"``: any excitation, transients included; records are cut to the shortest
-    one. The variances of noise and distortion are known as their sum only.
+    one. Only the sum of the variances of noise and distortion is known.
 
     ``"auto"``: robust if every record has periods, else local polynomials.
 
-    Records of one realisation of the input tell nothing of distortion, and count as periods of one
-    experiment. In records with periods it may begin anywhere.
+    Records of one realisation of the input do not show distortion, and count as periods of one
+    experiment. If they have periods, the realisation may begin anywhere in its period.
 
     If the records have a ``reference`` r, G is the response from r to y over that from r to u, so
-    that noise which a controller feeds back to the input, or that of the input's sensor, leaves no
-    bias. Without a reference the mean over periods removes most of such noise, and its share in the
-    power of the input, known from two periods or more, is subtracted.
+    that neither noise fed back by a controller nor noise of the input's sensor causes a bias.
+    Without a reference the mean over periods removes most of such noise. The noise power that is
+    left in the input is known from two periods or more, and is subtracted.
 
     Args:
-        records: data. A record is periodic if it has a ``period`` or ``start="periodic"`` (then of
-            one period unless it says otherwise).
+        records: data. A record is periodic if it has a ``period`` or ``start="periodic"`` (one
+            period long, unless ``period`` is given).
         method: see above.
         lines: numbers (F,) of DFT lines of the period (of the record, for local polynomials),
-            0 < line < N / 2. Default: those that are excited. The fast method needs all of these.
+            0 < line < N / 2. Default: all excited lines, which the fast method needs.
         band: lowest and highest frequency in Hz. Default: all lines.
         order: order of the local polynomials.
 
     Raises:
-        ValueError: a constant input, records of different periods or without, an input that does
+        ValueError: a constant input, records with different periods or with none, an input that
             not repeat or leaves lines without power, too few experiments, periods or lines.
 
     Example:
@@ -337,7 +337,7 @@ def _local_polynomial(
     cut = any(record.samples - record.skip > spectra.N for record in data)
     spectra, data, repeated = united(spectra, data, shifted=False)
     last = (spectra.N - 1) // 2
-    # Covariances are regular, and with one output a variance has a standard deviation of 45 %.
+    # Covariances are then regular; with one output, a variance has a standard deviation of 45 %.
     freedom = len(data[0].outputs) + 4
     n = half_width(order, freedom, len(data[0].inputs), len(data))
     if 2 * n + 1 > last:
@@ -432,10 +432,10 @@ def _response(spectra: Spectra, lines: Integers) -> Regression:
 
 
 def _without_noise(fitted: Regression, spectra: Spectra, lines: Integers) -> Regression:
-    """Least squares of noisy inputs without the bias that their noise has.
+    """Least squares with noisy inputs, without the bias that this noise causes.
 
-    As many of R experiments as there are inputs fit exactly, whatever the noise; the others leave
-    its share (R - nu) / R in UᴴU and UᴴY, which is subtracted, to first order in the noise.
+    nu of the R experiments fit exactly, whatever the noise. So the share (R - nu) / R of the noise
+    is left in UᴴU and UᴴY; it is subtracted, to first order in the noise.
     """
     U, Y = spectra.U[lines], spectra.Y[lines]
     R, nu = U.shape[1:]
@@ -453,7 +453,7 @@ def _without_noise(fitted: Regression, spectra: Spectra, lines: Integers) -> Reg
 
 
 def _noise(spectra: Spectra, lines: Integers, fitted: Regression) -> Complex:
-    """Covariance of vec(G) due to the noise; the mean of P periods has 1 / P of that of one."""
+    """Covariance of vec(G) due to the noise; a mean over P periods divides it by P."""
     C = _residual_noise(spectra.C[lines], fitted.G)
     return covariance(C, fitted.weights / np.sqrt(spectra.P))
 

@@ -1,9 +1,9 @@
 """Integrators in a linear model: one or two poles at z = 1, exactly, behind outputs.
 
 The output of a system that integrates is y = G(z) u with (z - 1)ⁿ G = G₁ + (z - 1) Q₁ + ... +
-(z - 1)ⁿ Qₙ, where G₁ is stable. So the difference v = (z - 1)ⁿ y follows from u by G₁, which the
-methods for stable systems find, and from the differences of u by constants. The integrators are
-put back behind them:
+(z - 1)ⁿ Qₙ, where G₁ is stable. So the difference v = (z - 1)ⁿ y is the output of G₁ for the input
+u, plus constants times differences of u. Methods for stable systems find G₁ and the constants. The
+integrators are put back behind them:
 
     x+ = A x + B u,   s₁+ = s₁ + C x + D u,   s₂+ = s₂ + s₁ + Q₁ u,   ...   y = sₙ + Qₙ u.
 
@@ -11,11 +11,12 @@ The difference turns white noise of y into blue noise, and errors that the syste
 such as those of friction, into white noise. Both together make the error of the difference a
 moving average 1 - λ z⁻¹ of white noise. All signals are filtered by 1 / (1 - λ z⁻¹), which whitens
 the error and leaves G₁ as it is: with λ = 0 the fit is to the difference, with λ near 1 to the
-output itself. The initial state of the filters is not known. It adds λᵏ to the output, whose
-size is a parameter.
+output itself. The unknown initial state of the filters adds a multiple of λᵏ to the output; the
+multiple is a parameter.
 
-Some outputs may have one integrator and others none, as a position and a speed do. Only the former
-are differenced then, and nothing is filtered: the errors of both are not alike.
+Some outputs may have one integrator and others none, as a position and a speed do. Then only the
+outputs with an integrator are differenced, and nothing is filtered, as the errors of the two kinds
+of output differ.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from lfrtorch.linear.model import LinearFit, LinearModel, linear_cell
 from lfrtorch.model.model import simulate_record
 
 _SAME_LINE = 1e-9
-"""Distance from z = 1 below which a line is the one at 0, where the response is infinite."""
+"""A line nearer to z = 1 than this is the line at 0 Hz, where the response is infinite."""
 
 
 def integrators_of(integrators: int | Sequence[int], ny: int) -> tuple[int, ...]:
@@ -57,9 +58,9 @@ def integrators_of(integrators: int | Sequence[int], ny: int) -> tuple[int, ...]
 
 
 def without_limits(record: Record, integrates: Bool[Booleans, " ny"]) -> Record:
-    """Return a record whose outputs that integrate are not valid where they are at a limit.
+    """Return a record whose integrating outputs are not valid where they are at a limit.
 
-    Their distance beyond it is not known, and so neither are their differences.
+    The distance of an output beyond its limit is not known, so that its differences are not, either.
     """
     if record.limits is None or record.start == "periodic":
         return record
@@ -82,9 +83,9 @@ def differenced(
     """Return the records of G₁: the output differenced n times, and all signals filtered.
 
     If only some outputs integrate, the others stay as they are. A difference is valid if all its
-    samples are; what a filter holds after a hole is known best from a model of the ``whole``.
+    samples are. Holes are filled from a model of the ``whole`` system, for the filters.
 
-    ``differences`` of u follow it as inputs, and what the start of a filter of pole λ adds.
+    The new inputs are u, its ``differences`` and, for filters with a pole λ, their free responses.
     """
     found = []
     for i, record in enumerate(records):
@@ -134,21 +135,21 @@ def _filtered(signal: Array, times: int, pole: float) -> Array:
 
 
 def whitening_pole(errors: Sequence[Array], integrators: int, pole: float = 0.0) -> float:
-    """Return λ of n filters that leave least of errors of G₁ which have passed those of ``pole``.
+    """Return the pole λ of n filters that makes errors of G₁, filtered by ``pole`` so far, white.
 
-    The errors count as white noise of the output, n times differenced, and white noise of G₁: a
-    moving average (1 - λ z⁻¹)ⁿ of white noise, which is smaller than what any other λ leaves.
+    The errors count as white noise of the output, differenced n times, plus white noise of G₁.
+    That is a moving average (1 - λ z⁻¹)ⁿ of white noise, and its λ leaves the least power.
     """
     n, T = integrators, min(map(len, errors))
     plain = [scipy.signal.lfilter(np.poly([pole] * n), [1.0], e, axis=0)[n:] for e in errors]
-    # The time constant of all filters is a tenth of the shortest record at most.
+    # The filters together have a time constant of at most a tenth of the shortest record.
     poles = 1.0 - np.geomspace(1.0, min(1.0, n / (0.1 * T)), 50)
     left = np.array([np.sum([_squares(e, n, pole) for e in plain], axis=0) for pole in poles])
     return float(poles[np.argmin(np.log(np.maximum(left, 1e-300)).sum(axis=1))])
 
 
 def _squares(errors: Array, n: int, pole: float) -> Array:
-    """Squares (ny,) of the errors (T, ny), filtered from the best start, but for a constant."""
+    """Return the squares (ny,) of filtered errors (T, ny), for the best start and constant."""
     T, ny = errors.shape
     signals = np.hstack([errors, np.ones((T, 1))])
     filtered = scipy.signal.lfilter([1.0], np.poly([pole] * n), signals, axis=0)
@@ -159,7 +160,7 @@ def _squares(errors: Array, n: int, pole: float) -> Array:
 
 
 def _filter_starts(samples: int, n: int, pole: float) -> Array:
-    """Return what n filters make of their start: λᵏ, k λᵏ, ..., (T, n)."""
+    """Return the free responses (T, n) of n filters: λᵏ, k λᵏ, ..."""
     k = np.arange(float(samples))[:, None]
     return pole**k * k ** np.arange(n)
 
@@ -184,7 +185,7 @@ def differenced_response(frf: FRF, integrators: int) -> FRF:
 
 
 def differenced_weight(frf: FRF, weight: Array, integrators: int) -> Array:
-    """Weights (F, ny, nu) of the errors of a response for those of G₁."""
+    """Turn weights (F, ny, nu) of the errors of a response into weights of the errors of G₁."""
     size = np.abs(np.exp(2j * np.pi * frf.frequencies / frf.fs) - 1.0)
     kept = size > _SAME_LINE
     return weight[kept] / size[kept, None, None] ** (2 * integrators)
@@ -216,12 +217,12 @@ def gain(records: Sequence[Record], *, offset: bool) -> LinearModel:
 
 
 def scored(records: Sequence[Record]) -> Booleans:
-    """Mask of the outputs of all records that count, after the skipped samples."""
+    """Return the mask of the scored outputs of all records, after the skipped samples."""
     return np.concatenate([record.scored[record.skip :] for record in records])
 
 
 def simulation_errors(model: LinearModel, record: Record) -> Array:
-    """Errors (T - skip, ny), 0 where none counts; an estimated start is that of all samples."""
+    """Return errors (T - skip, ny), 0 where not scored; all samples estimate the start."""
     if model.nx:
         y = model.simulate(replace(record, skip=0))
     else:
@@ -238,7 +239,7 @@ def integrated(
 ) -> LinearModel:
     """Put integrators behind outputs of a model; their states come last.
 
-    The operating point of the input moves to where they stand still, or as close to it as it can.
+    The operating point of the input moves to where the integrators stand still, or nearly so.
     """
     nu, added = len(like.inputs), int(integrates.sum())
 
@@ -293,7 +294,7 @@ def placed(
     *,
     offset: bool,
 ) -> LinearModel:
-    """Put a model about the operating point of records, with states of unit deviation there."""
+    """Put a model about the operating point of records, with states of unit standard deviation."""
     records = [replace(r, start="estimated") if r.start == "periodic" else r for r in records]
     scaler = Scaler.of(records, offset=offset)
     model = replace(model, y_offset=np.where(integrates, scaler.y_offset, model.y_offset))

@@ -26,15 +26,15 @@ from lfrtorch.linear.regression import (
 from lfrtorch.linear.spectra import NOISE_LINES, smoothed
 
 FOLLOWING = 10.0
-"""Power of the inputs that follows a reference at an excited line, relative to its error: 10 dB.
-The ratio of the responses of y and u has a bias of exp(-10) there."""
+"""A line is excited if the input power that follows a reference is 10 dB above its error. The ratio
+of the responses of y and u then has a bias of exp(-10)."""
 
 STRONGER = 100.0
-"""Power of the input at lines that tell the noise at a weaker one, relative to it: 20 dB. The
-models of chirps and steps in a loop are as good by 10 dB."""
+"""Lines with 20 dB more input power than a weaker line tell the noise there. For chirps and steps
+in a loop, 10 dB gives models that are as good."""
 
 CHUNK = 2**21
-"""Complex numbers of the windows that are in memory at a time: 32 MiB, and as many in copies."""
+"""Complex numbers of windows in memory at a time: 32 MiB, and as much again in copies."""
 
 
 class WindowErrors(NamedTuple):
@@ -116,14 +116,14 @@ def fit_local_polynomials(
 
         Y(k + r) = (Σ_s g_s rˢ) U(k + r) + Σ_s t_s rˢ + V(k + r),    s = 0 .. order
 
-    The records share g, and each has its own t. A projection across all polynomials of the order,
-    the same for all windows, removes t. The result is g_0 = G(k).
+    The records share g, and each has its own t. A projection orthogonal to all polynomials of the
+    order removes t; it is the same for all windows. The result is g_0 = G(k).
 
-    Where nothing else excites the input, a controller makes it from the noise. There G becomes one
-    over the controller and leaves no residual, which so tells nothing of the error. A
-    reference (as U; Y holds ``outputs``, then the inputs) leaves these lines undetermined. If there
-    is none, the noise at a weak input is at least that at a strong one, times the lines of a
-    window, as what the controller makes is common to them.
+    Where nothing else excites the input, a controller makes the input from the noise. There G
+    becomes one over the controller and leaves no residual, so that the residual does not show the
+    error. A reference (in U; Y then holds ``outputs`` columns of y, and the inputs) leaves such
+    lines undetermined. Without one, noise is added at lines of weak input: the noise at lines of
+    strong input, times the lines of a window, as the controller's input is common to these.
 
     References:
         Pintelon and Schoukens, "System Identification: A Frequency Domain Approach", 2nd ed.,
@@ -163,7 +163,7 @@ def fit_local_polynomials(
     G, determined, excited, weights, noise, alone = joined
     if outputs is None:
         noise = noise + width * _noise_of_stronger(noise, weights, determined)
-    else:  # noise alone passes now and then, and most of the lines about it do not
+    else:  # noise alone passes at some lines, but not at most of the lines about them
         determined &= smoothed(excited[:, None], NOISE_LINES)[:, 0] > 0.5
     cov = covariance(noise, weights.reshape(len(first), nu, -1))
     errors = WindowErrors(first, weights, noise, None if outputs is None else alone)
@@ -182,7 +182,7 @@ def _following(fitted: Regression, ny: int, freedom: int) -> Booleans:
 
 
 def _noise_of_stronger(noise: Complex, weights: Complex, determined: Booleans) -> Complex:
-    """Mean noise (F, ny, ny) where the inputs are stronger than at each line, 0 if nowhere."""
+    """Return the mean noise (F, ny, ny) of the lines with stronger inputs, 0 if there are none."""
     power = determined[:, None] / np.sum(np.abs(weights) ** 2, axis=(2, 3))
     power = (power / np.maximum(power.max(axis=0), 1e-300)).min(axis=1)
     order = np.argsort(-power, kind="stable")

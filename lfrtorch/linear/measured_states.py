@@ -1,4 +1,4 @@
-"""The linear model whose states are the outputs: each sample from the one before it."""
+"""The linear model whose states are the outputs: it predicts each sample from the one before."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lfrtorch.data.records import Record, Scaler
 from lfrtorch.linear.model import LinearFit, LinearModel
 
 _RIDGE = 1e-9
-"""Ridge relative to regressors of unit rms: it holds the weight of a constant one at 0."""
+"""Ridge relative to regressors of unit rms: it keeps the weight of a constant regressor at 0."""
 
 
 def measured_states_model(records: Sequence[Record]) -> LinearModel:
@@ -33,7 +33,7 @@ def measured_states_model(records: Sequence[Record]) -> LinearModel:
     v = np.hstack([y, u])
     scale = np.where((rms := np.sqrt((v**2).mean(axis=0))) > 0, rms, 1.0)
     v = np.hstack([v / scale, np.ones((len(v), 1))])
-    # The change from sample to sample, which the sum of large and nearly equal signals would lose.
+    # Fit the change from sample to sample, which rounding would lose in a fit of the samples.
     normal = v.T @ v + _RIDGE * len(v) * np.eye(v.shape[1])
     weights = np.linalg.solve(normal, v.T @ (after - y))
     error = after - y - v @ weights

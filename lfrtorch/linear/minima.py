@@ -1,8 +1,8 @@
 """Race of several starts to the best minimum of a linear model's error.
 
 Subspace methods give several first estimates of A and C, and least squares the B and D of each.
-The estimates that fit best are refined a few steps by Levenberg-Marquardt, the best of these to the
-end, as a single search may end in a poor minimum.
+Levenberg-Marquardt refines the estimates that fit best by a few steps, then the best of these to
+the end, as a single search may end in a poor minimum.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FIRST_STEPS = 8
 """Iterations after which the searches are compared."""
 
 _SAME = 1.0 + 2e-6
-"""Ratio of two costs up to which two searches are in the same minimum."""
+"""Two searches are in the same minimum if the ratio of their costs is at most this."""
 
 ALIKE = 1.001
 """Candidates whose costs differ by a factor below this count as one."""
@@ -43,7 +43,7 @@ class Candidate(NamedTuple):
 
 
 def candidates(problem: Problem, nx: int, more: Sequence[SubspaceEstimate] = ()) -> list[Candidate]:
-    """Return the candidates of finite cost, and more of them, the best one first."""
+    """Return the candidates of finite cost, those of ``more`` included, the best one first."""
     found = []
     for estimate in (*problem.subspace_estimates(nx), *more):
         cost, matrices = problem.with_input_matrices(estimate.A, estimate.C)
@@ -67,8 +67,8 @@ def best_minimum(
 ) -> tuple[SubspaceEstimate, Refined]:
     """Search from the candidates; after a few steps the best few go on, and the best is taken.
 
-    If initial states are estimated, the most probable minimum is taken. The one of least cost may
-    spend a mode on drift: on the cascaded tanks' record a pole of 0.999996.
+    If initial states are estimated, the most probable minimum is taken. The minimum of least cost
+    may use a mode for drift: on the cascaded tanks' record, a pole of 0.999996.
     """
     field: list[Candidate] = []
     last, nx = 0.0, len(tried[0].estimate.A)
@@ -107,7 +107,7 @@ def distinct(costs: Sequence[float], ratio: float) -> list[int]:
 
 
 def search_from(problem: Problem, matrices: Matrices) -> Search:
-    """Begin a search in balanced coordinates, with states of unit deviation."""
+    """Begin a search in balanced coordinates, with states of unit standard deviation."""
     A, B, C, D = matrices
     try:
         T, inverse = transformation(problem, matrices)
@@ -117,7 +117,7 @@ def search_from(problem: Problem, matrices: Matrices) -> Search:
 
 
 def transformation(problem: Problem, matrices: Matrices) -> tuple[Array, Array]:
-    """Return T and T⁻¹ to balanced coordinates with states of unit deviation."""
+    """Return T and T⁻¹ to balanced coordinates with states of unit standard deviation."""
     A, B, C, D = matrices
     T, inverse = balancing(A, B, C)
     std = problem.state_deviation((T @ A @ inverse, T @ B, C @ inverse, D))

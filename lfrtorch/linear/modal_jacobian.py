@@ -272,12 +272,12 @@ def _change(m: Modes, free: Booleans) -> Complex:
 
 
 def _without_scaling(m: Modes, change: Complex) -> Float[Array, "K P"]:
-    """Real rows that span the same directions: of one pole of a pair, and with the largest entry of
-    each bᵢ and cᵢ constant, as they have a common factor."""
+    """Return real rows that span the same directions: one pole of each pair, and the largest entry
+    of each bᵢ and cᵢ held constant, as bᵢ and cᵢ share a factor."""
     (ny, n), nu = m.c.shape, m.b.shape[1]
     poles, b, c, D = np.split(change, np.cumsum([n, n * nu, n * ny]))
     both = np.concatenate([b.reshape(n, nu, -1), c.reshape(n, ny, -1)], axis=1)
-    # A factor on bᵢ that cᵢ is divided by moves them along these.
+    # Multiplying bᵢ and dividing cᵢ by a factor moves both along these directions.
     along = np.concatenate([m.b, -m.c.T], axis=1)
     largest, at = np.abs(along).argmax(axis=1), np.arange(n)
     size = along[at, largest]  # 0 of a mode that no input moves and no output shows

@@ -41,10 +41,10 @@ class LinearFit:
         rmse: root mean squared error of the criterion over the data, in normalised units: of
             outputs of unit rms, or of weighted responses.
         iterations: iterations of the refinement.
-        reason: why it ended.
+        reason: why the refinement ended.
         seconds: duration of the estimation.
-        singular_values: those of the subspace, relative to the outputs' size: they drop after the
-            order that the data carry.
+        singular_values: singular values of the subspace, relative to the outputs' size: they drop
+            after the order that the data carry.
         notes: remarks on data and result for the user.
 
     Example:
@@ -69,7 +69,7 @@ class LinearModel:
         x+ = A x + B (u - u_offset) + K e
         y  = C x + D (u - u_offset) + y_offset + e
 
-    ``to_model`` is the same as a ``Model`` without static map, which simulates, predicts and saves.
+    ``to_model`` returns it as a ``Model`` without static map, which simulates, predicts and saves.
 
     Args:
         A, B, C, D: system matrices.
@@ -79,10 +79,10 @@ class LinearModel:
         K: gain of the innovations e. Default: no noise model.
         innovation_covariance: covariance of e. Default: no noise model.
         state_covariance: E x xᵀ over the training data, about 0. Default: not known.
-        covariance: that of the P = (nx + ny) (nx + nu) entries of A, B, C and D, row by row, one
+        covariance: covariance of the P = (nx + ny) (nx + nu) entries of A, B, C, D, row by row, one
             matrix after another. Default: not known.
         fit: record of the fit.
-        x_offset: state of the nonlinear model that x = 0 stands for, if it is linearised.
+        x_offset: for a linearised nonlinear model, the state of that model at x = 0.
         outside: parts of that state and of its input that the data did not reach, in words.
 
     Example:
@@ -150,11 +150,11 @@ class LinearModel:
         return frequency_response(self.A, self.B, self.C, self.D, z)
 
     def frf_std(self, frequencies: ArrayLike) -> Array:
-        """Its standard deviation (F, ny, nu) from the covariance of the parameters."""
+        """Standard deviation (F, ny, nu) of ``frf``, from the covariance of the parameters."""
         return np.sqrt(np.trace(self.frf_covariance(frequencies), axis1=-2, axis2=-1).clip(0.0))
 
     def frf_covariance(self, frequencies: ArrayLike) -> Array:
-        """Covariance of its real and imaginary part, (F, ny, nu, 2, 2)."""
+        """Covariance of the real and imaginary part of ``frf``, (F, ny, nu, 2, 2)."""
         z = unit_circle(frequencies, self.fs)
         return response_covariance(self.A, self.B, self.C, self.covariance, z)
 
@@ -200,7 +200,7 @@ class LinearModel:
             cell.state_covariance.copy_(torch.as_tensor(self.state_covariance))
 
     def to_model(self, y_scale: Array | None = None) -> Model:
-        """The same as a ``Model``, in the same coordinates; outputs of these scales, or of 1."""
+        """The same as a ``Model``, in the same coordinates; ``y_scale`` is 1 by default."""
         y_scale = np.ones(len(self.C)) if y_scale is None else y_scale
         unit = Scaler(self.u_offset, np.ones(self.B.shape[1]), self.y_offset, y_scale)
         cell = LFRCell(self.B.shape[1], len(self.C), self.nx, dtype=torch.float64, random=False)
@@ -209,7 +209,7 @@ class LinearModel:
         return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs, K=K)
 
     def to_scipy(self) -> scipy.signal.StateSpace:
-        """The deviations from the operating point as scipy's."""
+        """The deviations from the operating point as a ``scipy.signal.StateSpace``."""
         return scipy.signal.StateSpace(self.A, self.B, self.C, self.D, dt=1.0 / self.fs)
 
     def to_control(self) -> Any:
@@ -217,14 +217,14 @@ class LinearModel:
         return control_system(self)
 
     def save(self, folder: str | Path) -> Path:
-        """Write a checkpoint folder as a model does, with what is known of the estimate."""
+        """Write a checkpoint folder as a model does, with the fit and its covariances."""
         fit = None if self.fit is None else asdict(self.fit)
         known = {name: torch.tensor(v) for name in _KNOWN if (v := getattr(self, name)) is not None}
         return write_model(folder, self.to_model(), {"fit": fit, "outside": self.outside}, known)
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
-        """The linear model in a checkpoint folder, or in the ``linear/`` folder of a run's."""
+        """Load the linear model of a checkpoint folder, or of a run's folder ``linear/``."""
 
         def maker_of(own: Any) -> MapMaker:
             if isinstance(own, dict):
@@ -238,7 +238,7 @@ class LinearModel:
 
 
 def _scaled(model: LinearModel, record: Record) -> Model:
-    """The model with outputs of unit deviation in a record, if there are several."""
+    """The model with outputs of unit standard deviation in a record, if there are several."""
     if len(model.outputs) == 1 or record.y.shape[1] != len(model.outputs):
         return model.to_model()
     deviation = np.std(record.y, axis=0)
@@ -254,7 +254,7 @@ _KNOWN = {
 def _known(
     folder: str | Path, model: Model, about: Any, known: Mapping[str, Tensor]
 ) -> dict[str, Any]:
-    """Description of a linear model in a checkpoint, beside its numbers."""
+    """Return what a checkpoint says about a linear model, besides its system matrices."""
     cell = model.lfr.cell
     try:
         fit = None if about is None else about["fit"]

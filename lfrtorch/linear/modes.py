@@ -26,15 +26,15 @@ MINOR = 1 / 3
 Wiener-Hammerstein, Silverbox and the parallel Wiener-Hammerstein stand-in (orders 2 to 12, 10
 realisations) spurious modes have 0.01 to 0.29, the others 0.40 and more."""
 
-_ROUNDING = 1e-9  # radius below 1 that a pole at 1 may be computed to have
+_ROUNDING = 1e-9  # rounding error of the radius of a pole at 1
 
 
 def shares(
     model: LinearModel, data: Record | Sequence[Record]
 ) -> tuple[Complex128[Complex, " nx"], Float[Array, " nx"]]:
-    """Return poles, and the rms that the mode of each adds to the output, over the error's.
+    """Return the poles, and for each the rms of its mode in the output, over the error's rms.
 
-    A mode counts with its conjugate; of several outputs the largest share is taken.
+    A mode counts with its conjugate; for several outputs the largest share counts.
     """
     poles, right, left = _modes(model)
     nx, ny = len(poles), len(model.outputs)
@@ -69,13 +69,13 @@ def without_slow_minor_modes(
     """The model with no minor mode slower than the slowest one that matters.
 
     The poles of slower minor modes are moved to the radius of that one, at the same angle. Their
-    inputs are scaled so that they add the same to the output under white noise. Those on the unit
-    circle and beyond stay: they integrate, or are unstable, and white noise adds without end.
+    inputs are scaled so that they add the same to the output under white noise. Modes on the unit
+    circle and beyond stay: they integrate or are unstable, so that this share has no limit.
 
     Args:
         model: linear model.
         data: records of the nonlinear fit.
-        minor: largest of the ``shares`` of a minor mode; 0 changes nothing.
+        minor: a mode is minor if its share (``shares``) is at most this; 0 changes nothing.
 
     Returns:
         The model in balanced coordinates, without covariance; the same model if nothing is moved.
@@ -83,7 +83,7 @@ def without_slow_minor_modes(
     old, share = shares(model, data)
     matters = share > minor
     _, right, left = _modes(model)
-    if not matters.any() or np.linalg.cond(right) > 1e8:  # no mode, or none apart
+    if not matters.any() or np.linalg.cond(right) > 1e8:  # no mode matters, or none is distinct
         return model
     radius = np.abs(old[matters]).max()
     slow = ~matters & (np.abs(old) > radius) & (np.abs(old) < 1.0 - _ROUNDING)
@@ -94,7 +94,7 @@ def without_slow_minor_modes(
     A, B = ((right * new) @ left).real, ((right * gain) @ left @ model.B).real
     unknown = dict.fromkeys(("K", "innovation_covariance", "covariance", "state_covariance"))
     quick = replace(model, A=A, B=B, **unknown)
-    records = as_records(data)  # balanced in physical units, the states would depend on those
+    records = as_records(data)  # balanced states must not depend on the physical units
     u_scale = rms_scale([record.u for record in records], model.u_offset)
     y_scale = rms_scale([record.y for record in records], model.y_offset)
     return quick.transformed(*balancing(A, B * u_scale, model.C / y_scale[:, None]))

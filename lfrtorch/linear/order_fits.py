@@ -1,8 +1,8 @@
 """Linear models of several orders, each started from those below it and from one subspace.
 
-A scan of orders shares the spectra, and one decomposition that holds estimates of all orders. A
-model of a lower order, and as many more states as describe its errors best, is a start
-that is at least as good as that model, so that the error fitted falls with the order.
+All orders share the spectra, and one decomposition that holds estimates of every order. A model of
+a lower order, extended by the states that describe its errors best, is a start that is at least as
+good as that model. So the fitted error falls with the order.
 
 Records that are not periodic are fitted by their spectra, too, from initial states that are free at
 the first scored sample: see ``spectral_data_of_parts``. The sum of squares is that of a simulation.
@@ -34,7 +34,7 @@ from lfrtorch.linear.spectral_data import spectral_data_of_parts
 from lfrtorch.linear.subspace import SpectralSubspace, spectral_subspaces
 
 Window = tuple[int, int]
-"""First sample, and the one after the last."""
+"""Index of the first sample, and of the one after the last."""
 
 _MOST_STEPS = 80
 """Iterations of a search."""
@@ -50,8 +50,8 @@ def description_length(rmse: float, parameters: int, equations: float) -> float:
     """Return the error times M^(p / 2M), for p parameters and M independent equations.
 
     Its logarithm is the description length M ln V + p ln M of a mean square V, over 2M (Rissanen,
-    Automatica 14, 1978). The usual √(1 + p ln M / M) chose the true order in 13 of 20
-    cases as against 18.
+    Automatica 14, 1978). It chose the true order in 18 of 20 cases, the usual factor
+    √(1 + p ln M / M) in 13.
     """
     return rmse * equations ** (parameters / (2.0 * equations))
 
@@ -65,8 +65,8 @@ def fitted(model: LinearModel) -> float:
 class OrderFits:
     """Fits of several orders to the same data.
 
-    ``train`` has the records, and the windows of them, whose mean error is the offset of the
-    output: none for a response.
+    ``train`` holds the records and their windows, over which the mean error becomes the offset of
+    the output. It is empty for a response.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class OrderFits:
         self._y_offset = scaler.y_offset
 
     def _subspaces_for(self, nx: int) -> list[SpectralSubspace]:
-        """Return subspaces that hold the order: small ones as long as it is low."""
+        """Return subspaces that hold the order: small subspaces for low orders."""
         most = 12
         while most < nx:
             most *= 2
@@ -146,7 +146,7 @@ class OrderFits:
         longest = max(len(u) for u, _ in parts)
         enough = min(longest, 4 * (most + 1))  # samples of a part that is fitted
         kept = [i for i, (u, _) in enumerate(parts) if len(u) >= enough]
-        # Initial states are unknowns: of more parts eight are fitted, evenly spaced.
+        # Initial states are unknowns: at most eight parts are fitted, evenly spaced.
         kept = [kept[i] for i in np.unique(np.linspace(0, len(kept) - 1, 8).astype(int))]
         spectra = spectral_data_of_parts(
             [parts[i] for i in kept], [weights[i] for i in kept], offset=offset
@@ -198,15 +198,15 @@ class OrderFits:
     def _best(
         self, found: Sequence[Refined], clock: float, y_offset: Array
     ) -> tuple[Refined, LinearModel, list[Array]]:
-        """Choose the system of least simulation error, or least criterion of a response."""
-        # A free initial state may bring a mode that explains drift and fails in a simulation; the
-        # start of a search has it less than its minimum.
+        """Choose the system of least simulation error or, for a response, of least criterion."""
+        # With free initial states a minimum may have a mode that explains drift and fails in a
+        # simulation; the start of a search has less of it.
         models = [self._model(each, clock, y_offset) for each in found]
         best = int(np.argmin([fitted(model) for model, _ in models]))
         return found[best], *models[best]
 
     def _starts(self, nx: int) -> list[Matrices]:
-        """Return starts of finite cost, the best first; of those that are alike one."""
+        """Return starts of finite cost, the best first, and one of each group that is alike."""
         pairs = [
             pair
             for below in (nx - 2, nx - 1)
@@ -246,7 +246,7 @@ class OrderFits:
         self, found: Refined, clock: float, y_offset: Array
     ) -> tuple[LinearModel, list[Array]]:
         """Return the model in physical units, and its errors in each record."""
-        # The states that records begin from depend on the output's offset: a guess comes first.
+        # Estimated initial states depend on the output's offset, so that a guess of it comes first.
         found = self._without_starts(found)
         model = physical(found, self._scaler, self._about)
         model = model.transformed(*transformation(self._driven, found.matrices))

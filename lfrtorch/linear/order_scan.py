@@ -1,8 +1,8 @@
 """Order of the BLA: a scan over nx, scored on records that are not fitted.
 
-The fewest states are taken that do as well as the best (``data.paired_blocks``). Where the
-validation records are short against the system's memory, or unlike the training records, they say
-little of an order: the scores are then those of a cross-validation in time over both. Each of five
+The lowest order is taken that does as well as the best (``data.paired_blocks``). If the validation
+records are short compared with the system's memory, or unlike the training records, they say little
+about the order. The scores then come from a cross-validation in time over both. Each of five
 stretches is left out of a fit to the rest, and scored in a simulation of its whole record.
 """
 
@@ -46,7 +46,7 @@ _FOLDS = 5
 
 UNLIKE = 1.5
 """Validation and training records are unlike if the errors of the order that fits best differ by
-more than this factor between them: what is seen on one says little of the other."""
+more than this factor: the error on one then says little about the error on the other."""
 
 
 @dataclass(frozen=True)
@@ -54,16 +54,16 @@ class OrderScan:
     """Linear models of several orders, and the order that is chosen.
 
     Args:
-        models: one for each order; that of the order chosen is a full estimate.
-        scores: scores of the orders. With validation records the rms of the simulation error there,
-            each output relative to its rms; in a cross-validation over them and the training
-            records. Otherwise the error of the fit, times M^(p / 2M) for p parameters,
-            initial states among them, and M independent equations (minimum description length).
+        models: one model for each order; the model of the chosen order is a full estimate.
+        scores: scores of the orders. With validation records: the rms simulation error on them, or
+            in a cross-validation over them and the training records; each output is relative to its
+            rms. Otherwise: the error of the fit times M^(p / 2M) (minimum description length), for
+            p parameters, initial states included, and M independent equations.
             The fit of periodic records is to their mean periods, whose error is less than that of
             their samples.
         validated: validation records give the scores.
-        chosen: the lowest order whose score is within one standard error of the best, 5 % at most,
-            or within 1 %; without validation records the order of the best score.
+        chosen: the lowest order whose score is within 1 % of the best, or within both one standard
+            error and 5 % of it; without validation records the order of the best score.
         notes: why the scores are those of a cross-validation, and what orders were left out.
 
     Example:
@@ -119,14 +119,14 @@ def scan_orders(
 ) -> OrderScan:
     """Best linear approximations of several orders, and the lowest that is good enough.
 
-    The scan ends where the input excites fewer directions than an order has, where the data are too
-    few, and if several orders in a row bring nothing.
+    The scan ends when the input excites fewer directions than the order has, when there are too
+    few data, or when several orders in a row bring no improvement.
 
     Args:
         data: as for ``estimate_bla``.
         orders: the values of nx; those below the number of integrators are left out, if there are
             others.
-        validation: records that choose the order.
+        validation: records on which the order is chosen.
         watch: called with a line after each order.
         options: arguments of ``estimate_bla``.
 
@@ -155,7 +155,7 @@ def scan_orders(
     notes: list[str] = []
 
     def enter(tried: list[_Tried], new: _Tried, clock: float) -> bool:
-        """Enter and tell an order; return whether the last ones brought nothing."""
+        """Record and report an order; return whether the last ones brought no improvement."""
         tried.append(new)
         scores = _scores(tried)
         watch(
@@ -221,7 +221,7 @@ class _Tried(NamedTuple):
 
 
 def _rising(orders: Sequence[int], least: int) -> list[int]:
-    """Return the orders, each once; without those below the least, if there are others."""
+    """Return the orders once each, rising, without those below ``least`` if others remain."""
     if not len(orders):
         raise InputError("orders is empty; give at least one, for example range(1, 13).")
     for nx in orders:
@@ -231,7 +231,7 @@ def _rising(orders: Sequence[int], least: int) -> list[int]:
 
 
 def _scores(tried: Sequence[_Tried]) -> list[float]:
-    """Return the rms of all errors of each model, or its description length without any."""
+    """Return for each model the rms of its errors, or its description length if it has none."""
     return [_rms(each.errors) if each.errors else each.length for each in tried]
 
 
@@ -254,7 +254,7 @@ def _worthwhile(models: Sequence[LinearModel]) -> list[int]:
 def _first(tried: Sequence[_Tried]) -> int:
     """Return the first model that does as well as the best, or the one of the best score."""
     errors = [each.errors for each in tried]
-    if sum(map(len, errors[0])) < BLOCKS:  # or none
+    if sum(map(len, errors[0])) < BLOCKS:  # too few errors to judge by, or none
         return int(np.argmin(_scores(tried)))
     return Judge.of(errors).first_good()
 
@@ -270,8 +270,8 @@ def _doubt(
 ) -> str:
     """Say why validation records tell little of an order; empty if they tell enough.
 
-    They chose the order of ``model``, and the training records that of ``fittest``: a poor model
-    errs alike on both.
+    The judging records chose the order of ``model``. ``fittest`` has the order that fits the
+    training records best, as a poor model errs alike on both.
     """
     scored = sum(record.samples - record.skip for record in judges)
     memory = memory_of(model, max(record.samples for record in train))
@@ -288,9 +288,9 @@ def _doubt(
 
 
 def memory_of(model: LinearModel, samples: int) -> float:
-    """Return the time constant of one pole whose impulse response is as long, in samples.
+    """Return the memory in samples: the time constant of one pole with as long a response.
 
-    The slowest pole would say too much: it may be next to nothing in the response.
+    The slowest pole would overstate it, as it may hardly show in the response.
     """
     x, responses = model.B, []
     for _ in range(samples):
@@ -303,7 +303,7 @@ def memory_of(model: LinearModel, samples: int) -> float:
 
 
 class _Folds:
-    """Errors of fits that leave out a stretch of time each, in that stretch."""
+    """Errors in stretches of time, each from a fit that leaves the stretch out."""
 
     def __init__(
         self,
@@ -321,7 +321,7 @@ class _Folds:
         self._fits: list[OrderFits] = []
         chosen = {name: options.get(name, True) for name in ("offset", "feedthrough")}
         for begin, end in pairwise(cuts):
-            # In samples of each record; of one that has none the two are the same.
+            # In samples of each record; equal bounds if the stretch is not in the record.
             out = [
                 (int(np.clip(first + begin - at, first, last)),
                  int(np.clip(first + end - at, first, last)))
@@ -335,7 +335,7 @@ class _Folds:
             self._fits.append(OrderFits.of_windows(self._records, rest, most=most, **chosen))
 
     def errors(self, model: LinearModel) -> list[Array]:
-        """Return the relative errors in each stretch, of fits that begin at the model."""
+        """Return the relative errors in each stretch, of fits that are started at the model."""
         return [
             error for some in each_alone(partial(self._of, model), range(_FOLDS)) for error in some
         ]
@@ -351,7 +351,7 @@ class _Folds:
 
 
 def _united(train: list[Record], judges: list[Record]) -> list[Record]:
-    """Join training and validation records; one that goes on from another is one with it."""
+    """Join training and validation records; one that begins with a training record replaces it."""
     found = list(train)
     for judge in map(without_coordinates, judges):
         for i, record in enumerate(found):

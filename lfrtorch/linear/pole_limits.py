@@ -1,13 +1,14 @@
 """Limits for the poles of a model that is fitted to spectral lines.
 
-A resonance that is narrower than the lines are apart fits one of them, and a resonance outside the
-excited band that is much narrower than its distance from it fits the band's edge: the lines do not
-tell how narrow. A pole e^(-h + jω), of half-power width 2h, has the limit
+A resonance narrower than the spacing of the lines fits a single line. A resonance outside the
+excited band, much narrower than its distance from the band, fits the band's edge. In both cases the
+lines do not tell how narrow it is. A pole e^(-h + jω), of half-power width 2h, has the limit
 
-    h >= m(ω) = max(half the distance of the lines, REACH times that of ω from the nearest one).
+    h >= m(ω) = max(half the line spacing, REACH times the distance of ω to the nearest line).
 
 Residuals ρ e with e = max(0, 1 - h / m) and ρ² = PART |r|² raise the cost |r|² of poles beyond. So
-the fit keeps the limits unless the data clearly ask for more: a perfect model costs nothing anyway.
+the fit keeps the limits unless the data clearly ask for more. A perfect model, r = 0, has no
+penalty.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ PART = 0.1
 """Penalty of a pole far beyond its limit, relative to the squared error."""
 
 REACH = 1 / 3
-"""Half width of a pole outside the band, relative to its distance from it. The real pole of
-Bouc-Wen's linear model has 2 / 3."""
+"""Smallest half width of a pole outside the band, relative to its distance from the band. The real
+pole of Bouc-Wen's linear model has 2 / 3."""
 
 
 class PoleLimits:
@@ -65,7 +66,7 @@ class PoleLimits:
 
 
 class Excess:
-    """Residuals ρ e at some θ, and their derivative, from those of e and |r|."""
+    """Residuals ρ e at some θ, and their derivative, from e, |r| and their derivatives."""
 
     def __init__(
         self,

@@ -1,7 +1,7 @@
 """Records of one realisation of the input: the same period again, perhaps shifted in time.
 
-Nonlinear distortion is the same in each of them, so that they tell noise apart and not distortion:
-they count as more periods of one experiment. Without a trigger a record begins anywhere in its
+Nonlinear distortion is the same in all of them, so that they show noise but not distortion: they
+count as more periods of one experiment. Without a trigger a record begins anywhere in its
 period, so that spectra U and V of one realisation differ by V = U exp(-2πj k τ / N).
 """
 
@@ -18,8 +18,8 @@ from lfrtorch.linear.regression import outer
 from lfrtorch.linear.spectra import RELATIVE_POWER, Spectra
 
 ALIKE = 0.15
-"""Largest rms deviation of two spectra of one realisation, relative to them; two realisations have
-about √2. The lines count by their amplitude, as one strong line can always be shifted to agree."""
+"""Largest rms difference of two spectra of one realisation, relative to them; for two realisations
+it is about √2. Lines count by amplitude, not power, as a shift can always match one strong line."""
 
 FEW = 8
 """A shift is looked for with this many lines: fewer lines of two realisations agree by chance."""

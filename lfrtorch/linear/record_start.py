@@ -1,8 +1,9 @@
-"""Choice of a record's start, rest or motion: the one by which a linear model predicts better.
+"""Decide whether a record starts at rest or in motion, by the errors of two linear models.
 
-A file does not say it, and an identification decides it once, of the records that train.
-Two models are estimated from the first three quarters of the record, one from rest and one with an
-estimated start state. The last quarter, simulated from the record's start as well, judges them.
+A file does not say how its record starts. An identification decides this once, on the training
+records. Two linear models are estimated from the first three quarters of a record, one that starts
+at rest and one with an estimated start state. Both are then simulated from the record's start, and
+their errors in the last quarter are compared.
 """
 
 from __future__ import annotations
@@ -23,30 +24,33 @@ from lfrtorch.distributed import agreed
 from lfrtorch.linear.order_scan import scan_orders
 
 _LONGEST = 3000
-"""Samples that are looked at: a start is forgotten after some time constants."""
+"""At most so many samples are used: a start is forgotten after some time constants."""
 
 _JUDGED = 1 / 4
-"""Their part that judges."""
+"""Part of these samples, at the end, on which the errors are compared."""
 
 _TRIED = 3
-"""Most training records that tell whether all begin in motion: a trial takes some seconds."""
+"""At most so many training records are tried, as a trial takes some seconds. If each of them should
+start at rest, the other records do, too."""
 
 _ORDERS = range(1, 5)
 _ITERATIONS = 15
-"""Enough to rank the two starts: on two measured records, 200 gave the same ranking."""
+"""Iterations of a linear fit, enough to rank the two starts: on two measured records, 200 ranked
+them alike."""
 
 _CLEARLY = 0.95
-"""Rest has to lower the judging error by 5 %. An estimated start costs little where a record begins
-at rest (linear models of planted records, error on 20000 new samples: at most 1.02 times as large),
-and rest where it begins in motion costs up to 1.33 times, for an NL-LFR twice."""
+"""A start at rest is chosen if it lowers the error in the last quarter by 5 %. If a record starts
+at rest, an estimated start costs little: for linear models of simulated records, the error on 20000
+new samples was at most 1.02 times as large. If it starts in motion, a start at rest raises the
+error up to 1.33 times, and twice for an NL-LFR."""
 
 
 class StartTrial(NamedTuple):
-    """Errors of linear models by start, relative to the output's deviation.
+    """Errors of linear models by their start, relative to the output's standard deviation.
 
     Args:
-        zero, estimated: rms where they judge, of a model from rest and of one with an estimated
-            start.
+        zero, estimated: rms error in the last quarter, of the model that starts at rest and of the
+            model with an estimated start state.
     """
 
     zero: float
@@ -59,31 +63,31 @@ class StartTrial(NamedTuple):
 
     @property
     def in_motion(self) -> bool:
-        """Tell whether rest is clearly worse."""
+        """Tell whether an estimated start is clearly better than a start at rest."""
         return self.estimated < _CLEARLY * self.zero
 
     def __str__(self) -> str:
         """A sentence with both errors."""
         alike = min(self) >= _CLEARLY * max(self)
         return (
-            f"a linear model validates at {percent(self.zero)} of the output's deviation from rest "
-            f"and at {percent(self.estimated)} with an estimated start"
+            f"a linear model errs by {percent(self.zero)} of the output's standard deviation if it "
+            f"starts at rest, and by {percent(self.estimated)} with an estimated start"
             f"{', which does no harm at rest either' * alike}: start is {self.chosen}"
         )
 
 
 def try_starts(record: Record) -> StartTrial:
-    """Validate linear models of a record from rest and with an estimated start.
+    """Compare a linear model of a record that starts at rest to one with an estimated start.
 
     Raises:
-        ValueError: a record that is too short, or that excites too little.
+        ValueError: a record that is too short, or whose input excites too little.
     """
     seen = replace(record[:_LONGEST], reference=None, period=None)
     first = seen.samples - round(_JUDGED * seen.samples)
     if seen.samples - first < SHORTEST:
         raise InputError(
-            f"record '{record.name}' has {seen.samples} samples; {round(SHORTEST / _JUDGED)} tell "
-            "whether it begins at rest."
+            f"record '{record.name}' has {seen.samples} samples; to tell whether it begins at rest "
+            f"takes {round(SHORTEST / _JUDGED)}."
         )
     judges = {start: replace(seen, start=start, skip=first) for start in ("zero", "estimated")}
     skipped = {"zero": warm_up(first, 0), "estimated": 0}
@@ -101,13 +105,13 @@ def try_starts(record: Record) -> StartTrial:
         ).best
         for start, judge in judges.items()
     }
-    # Rounding differs between processes, and the choice must not.
+    # Rounding differs between processes, but they must make the same choice.
     errors = torch.tensor([error("zero"), error("estimated")], dtype=torch.float64)
     return StartTrial(*agreed(errors).tolist())
 
 
 def decided(dataset: Dataset) -> Dataset:
-    """Begin training records at rest that are undecided and clearly better so; notes say it."""
+    """Decide the start of undecided records: at rest if that is clearly better; notes say why."""
     if not dataset.undecided:
         return dataset
     open_, resting, notes = dataset.undecided, [], []
@@ -116,7 +120,7 @@ def decided(dataset: Dataset) -> Dataset:
         try:
             trial = try_starts(one.record[: one.seen])
         except InputError:
-            notes.append(f"{name}start is zero: no linear model tells how it begins")
+            notes.append(f"{name}start is zero: too little data or excitation to compare starts")
             resting.append(one)
         else:
             notes.append(f"{name}{trial}")

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Complex128
 from lfrtorch._support.types import Booleans, Complex
 
 DEPENDENT = 1e-10
-"""A column depends on those before it if its part orthogonal to them is relatively below this."""
+"""A column is dependent if its part orthogonal to those before it is below this share of it."""
 
 
 class Regression(NamedTuple):

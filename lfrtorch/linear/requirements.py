@@ -15,7 +15,7 @@ from lfrtorch.linear.spectral_data import SpectralData
 from lfrtorch.linear.subspace import shortest, suffice
 
 _REPEATS = 0.1
-"""Largest deviation of periods of an input, and of the means of an output, over the signal's."""
+"""Largest relative standard deviation of an input's periods, and of an output's period means."""
 
 
 def check_signals(records: list[Record]) -> None:
@@ -53,15 +53,15 @@ def without_inputs(record: Record, last: int) -> Record:
 
 
 def steady_state(records: Sequence[Record]) -> list[Record] | None:
-    """Return the whole periods in steady state, if they are most of what all records score."""
+    """Return the whole periods in steady state, or ``None`` if a record has too few of them."""
     found = [_steady_part(record) for record in records]
     return [record for record in found if record] if all(found) else None
 
 
 def of_response(records: Sequence[Record]) -> bool:
-    """Tell if records are best fitted by their response: a reference drives them, not in periods.
+    """Tell if records are best fitted by their response: a reference, and no steady state.
 
-    A controller makes such inputs, so that a simulation error of what they do is biased.
+    A controller makes part of such inputs from the output, which biases a simulation error.
     """
     referred = all(record.reference is not None for record in records)
     return referred and steady_state(records) is None
@@ -104,7 +104,7 @@ def check_spectral_data(data: SpectralData, nx: int, direct: int = 0) -> None:
 
 
 def excited_directions(records: Sequence[Record], nx: int) -> tuple[int, int]:
-    """Directions in which the input moves, and those that a model of the order has."""
+    """Count the directions in which the input moves, and those that a model of the order has."""
     nu = records[0].u.shape[1]
     wanted = 2 * nx + 1
     windows = [

@@ -4,7 +4,7 @@ The error at each DFT line is the measured Y minus G(z) U, where G(z) = C (zI - 
 response of the model. For given A and C it is linear in B and D, which one least-squares problem
 yields; that completes a subspace estimate to a model. Levenberg-Marquardt then refines all four
 matrices. A step that brings a pole out of the unit circle has an infinite cost, and is rejected;
-poles that the lines do not tell are limited by ``pole_limits``.
+``pole_limits`` limits poles that the lines do not determine.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from lfrtorch.linear.spectral_data import SpectralData
 from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_spectra
 
 MANY = 40
-"""Unknowns from which on the derivatives are computed by modes."""
+"""From this number of unknowns on, the derivatives are computed by modes."""
 
 
 class ResponseFit:
@@ -111,7 +111,7 @@ class ResponseFit:
         if not np.isfinite(J).all():
             return np.inf, matrices
         size = np.linalg.norm(J, axis=0)
-        # A state that nothing sees has a column that is 0 but for underflow: its input stays 0.
+        # A state that no output sees has a column of 0, up to underflow: its input stays 0.
         size = np.maximum(size, max(1e-100 * size.max(), 1e-300))
         best = scipy.linalg.lstsq(J / size, r, check_finite=False)[0] / size
         _, B, _, D = matrices
@@ -169,8 +169,8 @@ class ResponseFit:
 class ResponseProblem(LeastSquares):
     """Residual and Jacobian of a linear model over spectra; infinite if a pole passes a limit.
 
-    θ holds A, B, C and D, row by row, one matrix after another. States under all inputs
-    ``together`` are less work than under each one for inputs of few columns.
+    θ holds A, B, C and D, row by row, one matrix after another. If U has few columns, it is less
+    work to compute the states under all inputs ``together`` than under each input.
     """
 
     def __init__(
@@ -218,7 +218,7 @@ class ResponseProblem(LeastSquares):
         return Point(theta, residual, float(residual.square().sum()), (at,))
 
     def residual(self, theta: Tensor) -> Tensor:
-        """The same, of a θ alone."""
+        """Return the residual at θ alone."""
         return self.evaluate(theta).residual
 
     def linearise_at(self, point: Point) -> ResponseJacobian | ModalJacobian:
@@ -231,7 +231,7 @@ class ResponseProblem(LeastSquares):
         return ResponseJacobian(*self._jacobian(at), at.errors, excess)
 
     def linearise(self, theta: Tensor) -> ResponseJacobian | ModalJacobian:
-        """The same, of a θ alone."""
+        """Return the Jacobian at θ."""
         return self.linearise_at(self.evaluate(theta))
 
     def errors(self, theta: Tensor) -> Complex:
@@ -279,7 +279,7 @@ class ResponseProblem(LeastSquares):
         return solve_driven(A, B, z, self.data.U) if self._together else solve_resolvent(A, B, z)
 
     def _jacobian(self, at: _At) -> tuple[Complex, Reduction]:
-        """Weighted derivative of G U in the columns that are kept, and how these give all."""
+        """Weighted derivative of G U in the kept columns, and the reduction to all columns."""
         A, _, C, _ = at.matrices
         initial_states = torch.zeros(0, len(A), dtype=torch.float64)
         cell = linear_cell(*at.matrices)
@@ -368,7 +368,7 @@ class ResponseJacobian:
 
         if data.errors is not None:
             return data.errors.covariance(lambda e: scores(data.weighted(e)), len(inverse))
-        root = scores(self._errors).real  # whose squares are positive, whatever the rounding
+        root = scores(self._errors).real  # its squares are positive, whatever the rounding
         M, K = 2 * self._errors.size, self._rows.shape[1]
         return root.T @ root * (M / max(1, M - K))
 

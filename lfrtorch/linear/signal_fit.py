@@ -35,11 +35,11 @@ from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_signal
 from lfrtorch.model.model import simulate_record
 
 OBSERVERS = (1e-4, 1e-2, 1.0)
-"""Variances of the state noise that the initial innovation models of a prediction-error fit assume,
-besides none, relative to those of the states and in units of the output noise."""
+"""Variances of the state noise in the initial innovation models of a prediction-error fit, besides
+0: relative to the variances of the states, for output noise of variance 1."""
 
 UNSTABLE = 20.0
-"""Fall of -2 log likelihood that an unstable system has to bring."""
+"""An unstable system must lower -2 log likelihood by this."""
 
 
 class SignalFit:
@@ -64,7 +64,7 @@ class SignalFit:
         self._driven = [self._with_all_inputs(each) for each in records]
 
     def most_candidates(self, nx: int) -> int:
-        """Return how many subspace estimates are refined: one of long records, as it is good."""
+        """Return how many subspace estimates are refined: one for long records, as it is good."""
         return 8 if sum(map(len, self._us)) * nx**2 <= 200_000 else 1
 
     def many(self, nx: int) -> bool:
@@ -112,7 +112,7 @@ class SignalFit:
         return refining(problem, problem.theta)
 
     def unstable(self, found: Refined, max_iter: int) -> Refined:
-        """Return an unstable system that predicts clearly better, or the found one.
+        """Return an unstable system if it predicts clearly better, or else ``found``.
 
         In a loop the system need not be stable, but its predictor must be.
         """
@@ -125,9 +125,9 @@ class SignalFit:
         return more if clear else found
 
     def improbability(self, search: Search) -> float:
-        """Return the cost plus x0ᵀ P⁻¹ x0 of each estimated start, times the error's variance.
+        """Return the cost, plus x0ᵀ P⁻¹ x0 of each estimated start times the error's variance.
 
-        P is the covariance of the states that the inputs lead to from rest.
+        P is the covariance of the states when the inputs drive the model from rest.
         """
         problem, state = search.problem, search.state
         x0 = problem.errors.parameters.initial_states(state.theta)
@@ -138,7 +138,7 @@ class SignalFit:
             [problem.lfr.trajectory(group.u).x.flatten(0, 1) for group in problem.errors.groups]
         )
         spread, axes = torch.linalg.eigh(driven.mT @ driven / len(driven))
-        variances = spread.clamp_min(1e-12 * float(spread[-1]))  # not moved by the inputs
+        variances = spread.clamp_min(1e-12 * float(spread[-1]))  # if inputs do not move a state
         unlikely = float(((x0 @ axes).square() / variances).sum())
         return state.cost * (1.0 + unlikely / problem.size)
 
@@ -196,7 +196,7 @@ class SignalFit:
         for group in problem.errors.groups:
             shape = group.y.shape
             last = first + shape.numel()
-            if group.spectral:  # lines already
+            if group.spectral:  # its errors are DFT lines already
                 scores = (rows[first:last] * errors[first:last, None]).reshape(*shape, -1).sum(2)
             else:
                 J = np.fft.rfft(rows[first:last].reshape(*shape, -1), axis=1)
@@ -211,7 +211,7 @@ class SignalFit:
         return found * (problem.size / spare)
 
     def _with_all_inputs(self, each: NormalisedRecord) -> NormalisedRecord:
-        """Return the record with the cell's inputs: u, then y for a prediction, a constant."""
+        """Return the record with the cell's inputs: u, for a prediction y, and a constant."""
         inputs, record = [each.u], each.record
         if self._prediction:
             record.require_all_valid(PAST_OUTPUTS)
@@ -225,7 +225,7 @@ class SignalFit:
     def _problem(
         self, matrices: Matrices, K: Array, *, observed: bool = True, stable: bool = True
     ) -> Problem:
-        """Least-squares problem of the cell; unless ``observed`` in B, D and the constant alone."""
+        """Return the problem of the cell; unless ``observed``, B, D and the constant alone vary."""
         A, B, C, D = matrices
         nu, ny = self.nu, self.ny
         width = self._driven[0].u.shape[1]
@@ -238,7 +238,7 @@ class SignalFit:
             free_B[:, nu : nu + ny] = observed
         if self._offset:
             free_D[:, -1] = True
-            free_B[:, -1] = observed and self._prediction  # what y0 makes of the states by K
+            free_B[:, -1] = observed and self._prediction  # y0 reaches the states through K
         cell = linear_cell(A - K @ C, Bu, C, Dyu)
         for parameter in (cell.A, cell.Cy):
             parameter.requires_grad_(observed)
@@ -277,7 +277,7 @@ class SignalFit:
 class _PoleWall(Term):
     """A term without rows: infinite if a pole of a linear cell passes LARGEST_POLE.
 
-    If the cell is a predictor, so must the system be, of the ``outputs`` among the inputs.
+    If the cell is a predictor with ``outputs`` among its inputs, the system has the same limit.
     """
 
     def __init__(self, errors: SimulationErrors, outputs: slice | None) -> None:

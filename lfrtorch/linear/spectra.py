@@ -22,13 +22,13 @@ from lfrtorch.data.records import Record
 from lfrtorch.linear.regression import outer
 
 RELATIVE_POWER = 1e-4
-"""Smallest power of each input at an excited line, relative to its best line: -40 dB."""
+"""Smallest power of each input at an excited line, relative to its strongest line: -40 dB."""
 
 NOISE_LINES = 21
-"""Lines about each one that noise is averaged over."""
+"""Number of neighbouring lines over which noise is averaged."""
 
 _NO_POWER = 1e-12
-"""An input has no power at a line if it has less than this part of that of its best line."""
+"""An input has no power at a line if it has less than this part of its strongest line's power."""
 
 SILENT = 1e-10
 """Relative amplitude of the input below which a line is not excited."""
@@ -43,7 +43,7 @@ class Spectra(NamedTuple):
     U: Complex128[Complex, "F R nu"]  # means over the periods of a record
     Y: Complex128[Complex, "F R ny"]
     C: Complex128[Complex, "F ny+nu ny+nu"]  # covariance of the noise of [Y, U] in one period
-    freedom: int  # of C, which is 0 without any
+    freedom: int  # degrees of freedom of C; C is 0 if there are none
     P: Int64[Integers, " R"]  # periods of each record
     N: int  # samples of a period
     resolution: float  # fs / N, Hz
@@ -51,7 +51,7 @@ class Spectra(NamedTuple):
 
     @property
     def excitation(self) -> Complex128[Complex, "F R nu"]:
-        """Signals known without noise to excite: the references, or else the inputs."""
+        """Signals that excite the system: the references, which have no noise, or the inputs."""
         return self.U if self.reference is None else self.reference
 
     def frequencies(self, lines: Int64[Integers, " F"]) -> Float[Array, " F"]:
@@ -122,7 +122,7 @@ def _spectra(data: Sequence[Record], windows: list[slice], N: int) -> Spectra:
         mean = Z.mean(axis=0)
         E = np.fft.rfft(excited[window].reshape(-1, N, size - ny), axis=1) * (np.sqrt(2) / N)
         references.append(E.mean(axis=0))
-        # Line 0 is left out: a drift of the offset is no change of the input.
+        # Line 0 is left out: a drift of the offset is not a change of the input.
         changes.append(
             np.sum(np.abs(E - references[-1])[:, 1:] ** 2, axis=(0, 1)) / max(len(Z) - 1, 1)
         )
@@ -150,7 +150,7 @@ def _spectra(data: Sequence[Record], windows: list[slice], N: int) -> Spectra:
 
 
 def given_references(data: Sequence[Record]) -> list[Array | None]:
-    """Return the references of the records; all of them have one, or none."""
+    """Return the references of the records; all records must have one, or none."""
     with_one = [record.name for record in data if record.reference is not None]
     without = [record.name for record in data if record.reference is None]
     if with_one and without:
@@ -179,7 +179,7 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
     noise = np.diagonal(spectra.C, axis1=1, axis2=2).real[1 : last + 1, -len(inputs) :]
     noise = noise if spectra.reference is None else np.zeros_like(noise)
     shown = smoothed(noise, NOISE_LINES) * np.mean(1 / spectra.P)
-    # With two periods of one record, a line of noise alone has 30 times that once in 1e8.
+    # With two periods of one record, noise at a line exceeds 30 times its mean once in 1e8.
     excited = power > np.maximum(RELATIVE_POWER * power.max(axis=0), 30.0 * shown)
     if not noise.any():  # one period does not tell noise from a weak line
         excited &= np.stack([carrying(channel) for channel in power.T], axis=1)
@@ -195,11 +195,11 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
 
 
 def carrying(power: Array) -> Booleans:
-    """Tell which lines the input is meant to excite, of their power (F,).
+    """Return which lines the input is meant to excite, by their power (F,).
 
-    Sorted by power, they end where the next one has less than a hundredth: a measured input has
-    noise, hum and distortion at the lines that its generator leaves out. One or two lines of a
-    random input are as weak, and count; three are so once in 1e6.
+    Sorted by power, these lines end where the next line has less than a hundredth: a measured
+    input has noise, hum and distortion at the lines that its generator leaves out. One or two
+    lines of a random input are as weak, and count; three are as weak once in 1e6.
     """
     order = np.argsort(-power, kind="stable")
     ranked = power[order]
@@ -212,7 +212,7 @@ def carrying(power: Array) -> Booleans:
 
 
 def powered_lines(spectra: Spectra, n: int) -> Integers:
-    """Return the lines between 0 and fs / 2 within n lines of which every input has power."""
+    """Return the lines between 0 and fs / 2 about which, within n lines, all inputs have power."""
     last = (spectra.N - 1) // 2
     power = smoothed(np.mean(np.abs(spectra.excitation[1 : last + 1]) ** 2, axis=1), 2 * n + 1)
     return 1 + np.flatnonzero((power > _NO_POWER * power.max(axis=0)).all(axis=1))
@@ -228,9 +228,9 @@ def smoothed(power: Array, width: int) -> Array:
 def without_noise(
     power: Complex128[Complex, "F nu nu"], noise: Complex128[Complex, "F nu nu"]
 ) -> tuple[Complex128[Complex, "F nu nu"] | None, Bool[Booleans, " F"]]:
-    """UᴴU of inputs without the part of their noise, and at which lines that is most of it.
+    """Return UᴴU without the noise of the inputs, and the lines that keep more than half of it.
 
-    Elsewhere it is the unit matrix. It is ``None`` if the inputs have no noise.
+    At other lines it is the unit matrix. It is ``None`` if the inputs have no noise.
     """
     clear = np.ones(len(power), dtype=bool)
     if not np.abs(noise).max(initial=0.0) > 1e-24 * np.abs(power).max(initial=0.0):

@@ -57,7 +57,7 @@ class SpectralData:
 
     @property
     def independent(self) -> float:
-        """Real equations, those of lines that share windows as fewer independent ones."""
+        """Number of independent real equations: fewer if lines share windows."""
         return self.equations / (1.0 if self.errors is None else self.errors.sharing)
 
     @property
@@ -73,12 +73,12 @@ class SpectralData:
 def spectral_data_of_records(
     normalised: Sequence[NormalisedRecord], *, offset: bool
 ) -> SpectralData | None:
-    """Spectra of periodic records, or ``None`` if their simulation error is no sum over lines.
+    """Spectra of periodic records, or ``None`` if their simulation error is not a sum over lines.
 
-    Noise of the inputs would make every response too small, and what a controller feeds back would
-    bias it, too. The scatter over the periods tells its share in U Uᴴ and Y Uᴴ, on which
-    alone the fit depends: it is subtracted (Pintelon and Schoukens, 2012, chapter 9). Records
-    with references keep the part that follows these alone.
+    Noise on the inputs would make every response too small, and noise that a controller feeds back
+    would bias it. The fit depends on U Uᴴ and Y Uᴴ alone, and the scatter over the periods gives
+    the noise in these: it is subtracted (Pintelon and Schoukens, 2012, chapter 9). If records
+    have references, only the part that follows the references is kept.
     """
     records, ny = [each.record for each in normalised], normalised[0].y.shape[1]
     if any(r.start != "periodic" or r.skip for r in records):
@@ -135,11 +135,11 @@ def spectral_data_of_records(
 def spectral_data_of_parts(
     parts: Sequence[tuple[Array, Array]], weights: Sequence[float], *, offset: bool
 ) -> SpectralData:
-    """Spectra of stretches of signals, each from an initial state of its own, as of inputs.
+    """Spectra of stretches of signals, each with its own initial state, as an additional input.
 
     A stretch is one period of a periodic signal whose state jumps between its end and its
     beginning. The jump is the response to an impulse in the last sample, so that the impulse's
-    column of B is the jump, and D has none. By Parseval's theorem the sum of squared errors is the
+    column of B is the jump, and its D is 0. By Parseval's theorem the sum of squared errors is the
     mean square of the simulation errors from the best initial states.
     """
     R, total = len(parts), sum(len(u) for u, _ in parts)
@@ -172,7 +172,7 @@ def _twice(N: int) -> Array:
 def _line_0(
     means: list[tuple[Complex, Complex, float]], *, offset: bool
 ) -> tuple[Complex, Complex, Complex]:
-    """Line 0 of all records, projected across a constant that is common to them."""
+    """Line 0 of all records, projected orthogonally to a constant that is common to them."""
     U, Y = (np.stack([mean[side] for mean in means], axis=-1) for side in (0, 1))
     if offset:
         one = np.array([weight for _, _, weight in means])
@@ -191,7 +191,7 @@ class _Lines(NamedTuple):
 
 
 def _together(group: Sequence[_Lines]) -> tuple[Complex, Complex]:
-    """U and Y in at most nu columns, of records of one period, without the noise of U."""
+    """U and Y of records with one period, in at most nu columns, without the noise of U."""
     U = np.stack([record.U for record in group], axis=-1)
     Y = np.stack([record.Y for record in group], axis=-1)
     nu, R = U.shape[1:]
@@ -241,8 +241,8 @@ def spectral_data_of_response(
 ) -> tuple[SpectralData, Scaler, bool, list[str]]:
     """Return a response as spectra of channels of unit size, with their scaling.
 
-    Also whether the weights are the inverse variances of the errors, and notes on their choice.
-    ``differences`` of the inputs follow these.
+    Also return whether the weights are the inverse variances of the errors, and notes on the
+    weights. ``differences`` of the inputs follow the inputs.
     """
     weights, known, notes = _weights(frf, weight)
     u_scale = 1.0 / rms_scale([np.abs(frf.G).reshape(-1, frf.G.shape[2])], np.zeros(1))
@@ -265,9 +265,9 @@ def spectral_data_of_response(
 
 
 def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, bool, list[str]]:
-    """Weights (F, ny, nu) of the errors of G, whether these have no other variance, and notes.
+    """Return weights (F, ny, nu) of the errors of G, if they are inverse variances, and notes.
 
-    A noise variance is not that of the errors: nonlinear distortion adds to it.
+    A noise variance is less than the variance of the errors: nonlinear distortion adds to it.
     """
     notes: list[str] = []
     if isinstance(weight, list | tuple):
@@ -309,10 +309,10 @@ def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, boo
 
 
 def _of_other_windows(variance: Array, sizes: Array, errors: WindowErrors) -> Array:
-    """Variances (F, ny, nu) by the nearest lines whose windows share no line with the own.
+    """Variances (F, ny, nu) from the nearest lines whose windows share no line with a line's own.
 
-    Residual and input share the noise of G in a window: weights that know it favour lines where it
-    makes G small, a bias that does not fall with the length of the records.
+    In a window, the variance and G share the noise. Weights from the same window would favour lines
+    where noise makes G small: a bias that does not fall with the length of the records.
     """
     variance = variance / sizes[:, None]
     first, F, width = errors.first, len(variance), errors.weights.shape[3]

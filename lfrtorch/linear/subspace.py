@@ -38,14 +38,14 @@ MOVED_POLE = 0.999
 """Largest radius of an unstable pole after it is moved."""
 
 _SPECTRAL_HORIZONS = (1, 2)
-"""Block rows for spectra, in multiples of nx + 1; the fewest that tell the states apart are tried
-as well."""
+"""Block rows for spectra, in multiples of nx + 1. The smallest number that tells the states apart
+is tried as well."""
 
 HORIZONS = (2, 3, 5, 10)
 """Block rows for signals, in multiples of nx + 1."""
 
 MOST_OPERATIONS = 1e10
-"""Most multiplications of a decomposition; horizons that need more are skipped."""
+"""Largest number of multiplications of a decomposition; larger horizons are skipped."""
 
 
 class SubspaceEstimate(NamedTuple):
@@ -87,7 +87,7 @@ def from_spectra(
 class SpectralSubspace(NamedTuple):
     """Directions that hold estimates of every order, from one decomposition."""
 
-    directions: Array  # of the outputs that the inputs do not explain, the main one first
+    directions: Array  # of the part of the outputs that inputs do not explain, the main one first
     singular_values: Array
     size: float  # norm of the outputs
     whiten: Array  # what the noise of the outputs was divided by

@@ -11,8 +11,8 @@ from lfrtorch._support.types import Array, Complex
 def finite_zeros(A: Array, B: Array, C: Array, D: Array) -> Complex:
     """Finite invariant zeros, after those at infinity are taken out one by one.
 
-    The eigenvalues of the pencil [A - zI, B; C, D] will not do: rounding moves one at infinity of
-    multiplicity k to a radius of eps^(-1/k), 2e7 for a delay of five samples.
+    The eigenvalues of the pencil [A - zI, B; C, D] will not do: rounding moves an infinite zero of
+    multiplicity k to a radius of about eps^(-1/k), 2e3 for a delay of five samples.
 
     References:
         Emami-Naeini and Van Dooren, "Computation of zeros of linear multivariable systems",

@@ -84,7 +84,7 @@ def test_one_command_gives_table_notes_and_figure(file: Path, run):
     out = run(file, "data.inputs=[force]", "data.outputs=[level]")
     assert f"{file}: {T} samples at 50 Hz" in out
     assert "'time' is taken for the time, 50 Hz" in out
-    assert "from rest and at" in " ".join(out.split())
+    assert "at rest, and by" in " ".join(out.split())
     head, rule, force, level = out.splitlines()[4:8]
     assert head.split()[:4] == ["signal", "use", "samples", "missing"]
     assert set(rule) == {"-", " "}

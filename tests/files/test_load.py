@@ -880,7 +880,7 @@ def test_a_record_in_motion_has_an_estimated_start(tmp_path):
     data = decided(load_records(tmp_path / "a.csv", **AUTO))
     assert starts(data) == [("estimated", 0), ("estimated", 240), ("estimated", 320)]
     (note,) = data.notes
-    assert "from rest and at" in note
+    assert "at rest, and by" in note
     assert note.endswith("with an estimated start: start is estimated")
     table[-80:, 1] = 1e3  # outputs of the test choose nothing
     write(tmp_path / "b.csv", table, "u,y")
@@ -959,7 +959,7 @@ def test_whole_periods_in_steady_state_are_periodic(tmp_path):
     periodic(tmp_path / "a.csv", 5)
     data = decided(load_records(tmp_path / "a.csv", **AUTO))
     assert starts(data)[0] == ("zero", N)  # the transient is left out, and tells enough
-    assert not any("from rest and at" in note for note in data.notes)
+    assert not any("at rest, and by" in note for note in data.notes)
 
 
 def test_a_record_that_tells_nothing_is_from_rest(tmp_path):
@@ -968,7 +968,7 @@ def test_a_record_that_tells_nothing_is_from_rest(tmp_path):
     for name in "ab":
         data = decided(load_records(tmp_path / f"{name}.csv", **AUTO, validation=0, test=0))
         assert data.train[0].start == "zero"
-        assert data.notes == ("start is zero: no linear model tells how it begins",)
+        assert data.notes == ("start is zero: too little data or excitation to compare starts",)
 
 
 @pytest.mark.numeric

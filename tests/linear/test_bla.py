@@ -571,7 +571,7 @@ def test_error_and_data_must_go_together():
     for nx in (0, -1):
         refused(f"nx is {nx}; give a whole number of at least 1", record, nx)
     refused("refine is 'output'; give 'simulation', 'prediction'", record, refine="output")
-    refused("weight is that of a response: use refine='frequency'.", record, weight="noise")
+    refused("weight is for a response only: use refine='frequency'.", record, weight="noise")
     with pytest.raises(ValueError, match="refine is 'simulation', an error of records"):
         estimate_bla(estimate_frf(record), 1, refine="simulation")
 
