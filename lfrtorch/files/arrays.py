@@ -78,9 +78,9 @@ class Signal:
     shape: tuple[int, ...]  # as it is in the file
     dtype: np.dtype
     unit: str = ""
-    reverse: bool = False  # the file has the axes in the order that is not the user's
+    reverse: bool = False  # the file stores the axes in the reverse of the user's order
     values: NDArray[Any] | None = None  # if it is in memory; a lone number always is
-    packing: _Packing | None = None  # how numbers are stored, if not as they are
+    packing: _Packing | None = None  # how numbers are packed; None if they are stored as they are
 
     @property
     def shown(self) -> str:
@@ -93,14 +93,14 @@ class Signal:
         return max(self.shape, default=1) == np.prod(self.shape) > 1
 
     def refusal(self) -> str:
-        """Why it is no signal; nothing if it is one."""
+        """Why the array is not a signal; empty if it is one."""
         kind = self.dtype.kind
         if kind == "c":
             return f"is complex ({self.dtype}); store real and imaginary part apart"
         if kind not in _REAL + _TIMES:
             return f"has no numbers (its type is {self.dtype}); store an array of real numbers"
         if np.prod(self.shape) <= 1:
-            return "has one number or none, and is no signal"
+            return "has one number or none, and is not a signal"
         if len(self.shape) > 2:
             return f"is {self.shown}; give samples × channels"
         if len(set(self.shape)) < len(self.shape):
@@ -112,17 +112,19 @@ class Signal:
 
 
 class ArrayTable(Table):
-    """Arrays by name; those of a table that are read together have one length.
+    """Arrays by name; arrays of a table that are read together have one length.
 
-    Time runs along the axis of an array that is as long as a vector of the file is, and of two such
-    axes, or none, along the longer one. An array u of k channels has the columns u1 .. uk, one of a
-    channel the column u. A lone number with the name of a sampling frequency or time is a rate.
+    Time runs along the axis of an array that is as long as a vector of the file. If two axes are,
+    or none, it runs along the longer one. An array u of k channels has the columns u1 .. uk, an
+    array of one channel the column u. A lone number with the name of a sampling frequency or time
+    is a rate. channel the column u. A lone number with the name of a sampling frequency or time is
+    a rate.
     """
 
     def __init__(self, path: Path, found: Mapping[str, Signal | str], stored: Stored) -> None:
         self._stored = stored
-        self._signals: list[tuple[str, int]] = []  # of each column
-        self._axes: dict[str, int] = {}  # of time
+        self._signals: list[tuple[str, int]] = []  # array and channel of each column
+        self._axes: dict[str, int] = {}  # axis of time of each array
         self._packing = {
             name: s.packing for name, s in found.items() if isinstance(s, Signal) and s.packing
         }
@@ -197,7 +199,7 @@ class ArrayTable(Table):
 
 
 def _sampling_rate(name: str, signal: Signal) -> float | None:
-    """Return the sampling frequency of a lone number with the name of it or of its inverse."""
+    """Return the sampling frequency from a lone number that is named as a frequency or interval."""
     own = re.split(r"[./]", name)[-1]
     frequency, interval = _FREQUENCY.fullmatch(own), _INTERVAL.fullmatch(own)
     value = signal.values
@@ -248,7 +250,7 @@ def npz(path: Path) -> ArrayTable:
 
 
 def npy(path: Path) -> ArrayTable:
-    """The array that numpy.save wrote, by the file's name; it is read as it is needed."""
+    """The array that numpy.save wrote, by the file's name; its samples are read when needed."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except _UNREADABLE as error:
@@ -312,7 +314,7 @@ def _variable(name: str, value: Any, found: dict[str, Signal | str]) -> None:
 
 
 def hdf5(path: Path, *, matlab: bool = False) -> ArrayTable:
-    """The datasets of an HDF5 file by their paths, or of one by MATLAB by dotted names."""
+    """The datasets of an HDF5 file by their paths, or by dotted names if MATLAB wrote it."""
     h5py = optional("h5py")
     found: dict[str, Signal | str] = {}
     names: dict[str, str] = {}
@@ -373,19 +375,19 @@ def _is_cell(item: Any) -> bool:
 
 
 def _refusal(item: Any, above: frozenset[int], matlab: bool) -> str:
-    """Why an HDF5 object holds no signals; nothing if it may hold some."""
+    """Why an HDF5 object is not read; empty if it may hold signals."""
     h5py = optional("h5py")
     if isinstance(item, h5py.Group):
         if "MATLAB_sparse" in item.attrs:
             return "is sparse; store full(x)"
         inside = h5py.h5o.get_info(item.id).addr in above
-        return "is a group that it lies in itself; leave it out" if inside else ""
+        return "is a group inside itself; leave it out" if inside else ""
     if matlab and item.dtype.kind == "O":
         what = "cells" if _is_cell(item) else "structs"
         return f"is an array of {item.size} {what}; store the arrays of one"
     if matlab and item.attrs.get("MATLAB_class") in (b"char", b"string"):
         return "is text; store an array of real numbers"
-    # MATLAB_object_decode of an object: what is stored is where its parts are.
+    # MATLAB_object_decode marks an object: the dataset only says where its parts are stored.
     if matlab and item.attrs.get("MATLAB_object_decode", 0) == 3:
         return _IS_OBJECT
     if item.shape is None or (matlab and "MATLAB_empty" in item.attrs):
@@ -398,7 +400,7 @@ def _refusal(item: Any, above: frozenset[int], matlab: bool) -> str:
 
 
 def _packing(item: Any) -> _Packing | None:
-    """Storage of a dataset's numbers, as its attributes describe it."""
+    """Return how a dataset's numbers are packed, from its attributes."""
     given = [
         np.asarray(item.attrs.get(key)) for key in ("scale_factor", "add_offset", "_FillValue")
     ]
@@ -413,7 +415,7 @@ def _packing(item: Any) -> _Packing | None:
 
 
 def _linked(group: Any, key: str) -> Any:
-    """Members of a group, or the reason why a link is refused: no file opens another file."""
+    """Return a member of a group, or why its link is refused: no file may open another file."""
     h5py = optional("h5py")
     link = group.get(key, getlink=True)
     if isinstance(link, h5py.ExternalLink):

@@ -21,14 +21,14 @@ from lfrtorch.files.table import rate_behind
 from lfrtorch.files.text import Layout, Line, TextTable, layout_of, with_point
 
 _HEAD = 1000
-"""Rows that tell where the samples begin."""
+"""First rows of a sheet, in which the beginning of the samples is looked for."""
 
 _MOST_ROWS = 2**20
-"""Rows that a sheet of Excel may have."""
+"""Largest number of rows of a sheet of Excel."""
 
 _PACKED = 100
-"""Largest ratio of unpacked to packed size for parts of 1e8 bytes and more: see Apache POI,
-ZipSecureFile, whose limits are 100 times and 1e5 bytes. Sheets of numbers are packed 5 to 20 times.
+"""Largest ratio of unpacked to packed size for parts of 1e8 bytes and more. Apache POI's
+ZipSecureFile has limits of 100 times and 1e5 bytes. Sheets of numbers are packed 5 to 20 times.
 """
 
 _DELIMITER = "\t"
@@ -38,7 +38,7 @@ EXTENSIONS = (".xlsx", ".xlsm")
 
 
 def workbook(path: Path) -> tuple[Path, str]:
-    """The file of a path and what stands behind it, ``rig.xlsx#Run 2``, empty if nothing."""
+    """Split a path as ``rig.xlsx#Run 2`` into the file and what follows #, empty if nothing."""
     name, mark, behind = str(path).rpartition("#")
     file = Path(name)
     if not mark or path.is_file():
@@ -48,9 +48,9 @@ def workbook(path: Path) -> tuple[Path, str]:
 
 
 class ExcelTable(TextTable):
-    """A sheet read as lines of text: that behind the path, or the first with samples."""
+    """A sheet read as lines of text: the sheet named in the path, or the first with samples."""
 
-    # openpyxl reads row by row; calamine ends the process on a cell whose reference is damaged.
+    # openpyxl reads row by row. calamine would end the process at a damaged cell reference.
 
     def __init__(self, path: Path) -> None:
         self._file, sheet = workbook(path)
@@ -78,7 +78,7 @@ class ExcelTable(TextTable):
             )
 
     def _layout(self, sheet: Any) -> tuple[Layout, list[int]]:
-        """Where what is, and the columns in use."""
+        """Return the layout of a sheet and the columns in use."""
         rows = list(islice(self._rows(sheet), _HEAD))
         head = [[_text(cell) for cell in row] for row in rows]
         width = max(map(len, head), default=0)
@@ -117,7 +117,7 @@ class ExcelTable(TextTable):
         return (_DELIMITER.join(cells) if any(cells) else "") + "\n"
 
     def _plain(self, cell: Any) -> str:
-        """A cell as it stands in a line."""
+        """A cell as text in a line."""
         if type(cell) is float:  # nearly all are
             return repr(cell)
         return _NO_TEXT.sub(" ", with_point(_text(cell), comma=self._comma))
@@ -128,7 +128,7 @@ class ExcelTable(TextTable):
         try:
             self._refuse_bombs()
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # styles and extensions that say nothing of numbers
+                warnings.simplefilter("ignore")  # of styles and extensions, which hold no numbers
                 book = openpyxl.load_workbook(self._file, read_only=True, data_only=True)
         except InputError:
             raise
@@ -151,7 +151,7 @@ class ExcelTable(TextTable):
 
     def _rows(self, sheet: Any) -> Iterator[Sequence[Any]]:
         """Rows of a sheet, read one by one."""
-        sheet.reset_dimensions()  # what programs write of the size may be wrong
+        sheet.reset_dimensions()  # the size that a program wrote may be wrong
         rows = enumerate(sheet.iter_rows(values_only=True))
         while True:
             try:
@@ -171,7 +171,7 @@ class ExcelTable(TextTable):
 
 
 def _text(cell: Any) -> str:
-    """A cell as a text file would have it; a time of day or a duration in seconds."""
+    """A cell as text, as a text file would have it; times of day and durations in seconds."""
     if cell is None:
         return ""
     if isinstance(cell, time):

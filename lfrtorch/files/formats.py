@@ -37,7 +37,7 @@ _INSTEAD = {
 
 
 def open_table(path: str | Path) -> Table:
-    """Open the table of a file, of the sheet behind its name, ``rig.xlsx#Run 2``, or at a rate."""
+    """Open the table of a file, of a sheet (``rig.xlsx#Run 2``), or at a rate (``x.csv#50Hz``)."""
     path = expanded(path)
     if path.is_dir():
         inside = sorted(p.name for p in path.iterdir() if extension(p) in FORMATS)
@@ -67,7 +67,7 @@ def open_table(path: str | Path) -> Table:
 
 
 def extension(path: Path) -> str:
-    """The extension in lower case, of a compressed text file that of the text."""
+    """The extension in lower case; for a compressed text file, the extension of the text."""
     kind = path.suffix.lower()
     if kind != ".gz":
         return kind
@@ -76,7 +76,7 @@ def extension(path: Path) -> str:
 
 
 def similar(path: Path) -> str:
-    """Files in place of a missing one, as the end of a message."""
+    """Suggest files in place of a missing one, as the end of a message."""
     folder = path.parent
     while not folder.is_dir() and folder != folder.parent:
         folder = folder.parent

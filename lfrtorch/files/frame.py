@@ -16,7 +16,7 @@ from lfrtorch.files.arrays import optional
 from lfrtorch.files.table import BLOCK, Clock, Table
 
 Frames = Callable[[list[int], int], Iterator[Any]]
-"""Returns frames of some columns, by their numbers, with at most so many rows."""
+"""Returns frames of columns, given by their numbers, with at most a given number of rows."""
 
 
 class FrameTable(Table):
@@ -50,7 +50,7 @@ class FrameTable(Table):
 
 
 def frame_tables(given: Any) -> list[FrameTable]:
-    """The tables of a frame, or of a list of them; none of anything else."""
+    """The tables of a frame or of a list of frames; empty for anything else."""
     if is_frame(given):
         return [_in_memory(given, "frame")]
     if isinstance(given, list | tuple) and given and all(map(is_frame, given)):
@@ -59,7 +59,7 @@ def frame_tables(given: Any) -> list[FrameTable]:
 
 
 def _in_memory(frame: Any, name: str) -> FrameTable:
-    """A frame, with its index as the first column if that is a time."""
+    """The table of a frame; the index is its first column if it holds times."""
     times, index = index_times(frame), f"{frame.index.name or 'time'}"
     if times is not None:
         frame = frame.copy(deep=False)
@@ -95,7 +95,7 @@ def parquet(path: Path) -> FrameTable:
     def frames(columns: list[int], samples: int) -> Iterator[Any]:
         names = [headers[column] for column in columns]
         try:
-            # Read ahead, the whole file would come to be in memory.
+            # With read-ahead, the whole file would end up in memory.
             with pq.ParquetFile(path, pre_buffer=False) as file:
                 for batch in file.iter_batches(samples, columns=list(dict.fromkeys(names))):
                     yield batch.select(names).to_pandas(ignore_metadata=True)

@@ -51,19 +51,19 @@ EVERYTHING = "all"
 """Value of ``test`` that takes all records."""
 
 _LEFT_OUT = "left out, as it is too short"
-_SAME = 1e-4  # relative, of sampling frequencies: what printed time stamps leave open
+_SAME = 1e-4  # relative difference of sampling frequencies that rounded time stamps may cause
 
 
 @dataclass(frozen=True)
 class _Whole:
-    """A file's record, or that of a stretch between its gaps, before it has a use."""
+    """The record of a file, or of a stretch between its gaps, before it has a use."""
 
     record: Record
     path: Path
-    stem: str  # of all runs and stretches of the file
+    stem: str  # name that all runs and stretches of the file share
     stretch: bool
-    seen: int  # samples that may tell how it begins
-    rest: int | None  # samples that do not count if it begins at rest; None if that is known
+    seen: int  # samples on which its start may be decided
+    rest: int | None  # samples to skip if it begins at rest; None if its start is decided
 
 
 @typed("path", "inputs", "outputs", "reference")
@@ -91,39 +91,41 @@ def load_records(
     TDMS (.tdms), MCAP and ROS 2 bags (.mcap, .db3) and UFF58 (.uff, .unv). All but Excel may be
     interpolated to a rate, as ``"drive.mf4#50Hz"`` or ``"x.csv#50Hz"``.
 
-    A file is one record. It is one for each of its runs if a column that is named as their number
-    is, as ``run`` or ``trial``, has each of its values in one stretch, or if the time begins again.
+    A file is one record, or one for each of its runs. It has several runs if a column named as a
+    run number, such as ``run`` or ``trial``, has each of its values in one stretch, or if the time
+    begins again.
 
-    A part cut off by a fraction is simulated from the beginning of its record: only
-    its own part is scored, so that the transient of the start reaches neither validation nor test.
+    A part cut off by a fraction is simulated from the beginning of its record, but only its own
+    samples are scored. So the transient of the start reaches neither validation nor test.
 
     Args:
-        path: a file, a pattern as ``"runs/*.csv"``, or a list of these; ``"rig.xlsx#Run 2"`` is a
-            sheet of a workbook. Default: its first that has samples. Or a pandas data frame, or a
-            list of them, with an index of times or ``fs``.
+        path: a file, a pattern such as ``"runs/*.csv"``, or a list of these; ``"rig.xlsx#Run 2"``
+            is a sheet of a workbook (default: the first sheet that has samples). Or a pandas data
+            frame, or a list of them, with an index of times or ``fs``.
         inputs: one or several names of columns or arrays, or column numbers from 0. An array of
             several channels is several inputs, and ``"acc[0]"`` is the first channel of ``acc``.
             Default: those whose names leave no doubt, as ``u``, or ``u1`` and ``u2``.
         outputs: likewise; by name ``y``, or ``y1`` and ``y2``.
         fs: sampling frequency in Hz. Default: from ``time``.
-        time: the column of time stamps, in seconds or as ISO date-times. Default: one that is named
+        time: the column of time stamps, in seconds or as ISO date-times. Default: a column named
             as time is; or a lone number like ``Fs`` in a file of arrays; or another column that
             rises evenly. Signals at uneven times are interpolated to even ones.
         units: units of the channels by name or column number. Default: those in the file's header.
-        validation: records that choose among iterates and are not fitted: a fraction below 1 of
-            every record, the part after that for training; a number of records, the last ones;
-            names of records of ``path``, which are those of the files without extension; or other
+        validation: records that choose among iterates and are not fitted. A fraction below 1: that
+            part of every record, after the training part. A whole number: that many of the last
+            records. Names: records of ``path``, called as their files without extension. Or other
             files, as for ``path``. 0 for none.
-        test: records that are scored, likewise: of a fraction the last part, of a number the last
-            records. ``"all"``: every record, for a model that is there; nothing is left to fit.
-        start: ``"zero"`` (at rest), ``"estimated"`` (amid the measurement), ``"measured"`` (the
-            outputs are the states), or ``"periodic"``: every record is cut to whole periods in
-            steady state. Default: a record of whole periods
-            that has settled from its first sample on is periodic. Other records have an estimated
-            start, whose middle is rest; :func:`lfrtorch.identify` begins those at rest that train
-            and whose linear models validate clearly better so, see ``Dataset.undecided``. With
-            ``test="all"`` all are from rest.
-        period: samples of one period of the inputs; ``"auto"`` finds it, ``None`` is none.
+        test: records that are scored, likewise; a fraction takes the last part of every record, a
+            number the last records. ``"all"``: every record, to score an existing model without
+            a fit.
+        start: ``"zero"`` (at rest), ``"estimated"`` (in motion), ``"measured"`` (the outputs are
+            the states), or ``"periodic"``: every record is cut to whole periods in steady state.
+            Default: a record of whole periods that is settled from its first sample on is periodic.
+            Other records have an estimated start, with rest as its most likely value.
+            :func:`lfrtorch.identify` sets it to ``"zero"`` for training records that linear models
+            fit clearly better so, see ``Dataset.undecided``. With ``test="all"`` these records
+            start at rest.
+        period: samples of one period of the inputs; ``"auto"`` finds it, ``None`` means no period.
         skip: samples at the beginning of every record that are left out of cost and score.
             Default: a record from rest skips the periods in which the output settles, or 5 % if
             the input does not repeat. An estimated start skips none, and scores leave out the first
@@ -132,7 +134,7 @@ def load_records(
             a value out of fits and scores (``Record.valid``); up to four samples in a row that the
             times lack are filled so, the inputs on a line. ``"split"`` makes a record of every
             stretch between missing values of any kind.
-        limits: least and greatest output that the sensors show, see :class:`lfrtorch.Record`; for
+        limits: smallest and largest output that the sensors show, see :class:`lfrtorch.Record`; for
             example ``(None, 10)``.
         reference: setpoint if a controller makes the inputs, or the generator's signal if the
             inputs are measured with noise: one or several columns, as for ``inputs``, one for each
@@ -142,7 +144,7 @@ def load_records(
         u, y of a record: (its samples, inputs), (its samples, outputs), in the file's units.
 
     Returns:
-        The records; ``notes`` say what was found of periods, transients, time and gaps.
+        The records; ``notes`` say what was found about periods, transients, time and gaps.
 
     Raises:
         ValueError: a file, column or setting that cannot be used, files that do not belong
@@ -241,13 +243,13 @@ class _Reader:
         self._notes: dict[str, list[str]] = {}
 
     def note(self, name: str, *texts: str) -> None:
-        """Keep what is to be known of a record, or of all if the name is empty."""
+        """Keep a note on a record, or on all records if the name is empty."""
         for text in texts:
             self._notes.setdefault(text, []).append(name)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """A sentence each, with the records it is about if that is not clear."""
+        """Return the notes, each with the records that it is about unless that is clear."""
         return tuple(
             text if len(self.all) == 1 or names == [""] else f"{_some(names)}: {text}"
             for text, names in self._notes.items()
@@ -319,7 +321,7 @@ class _Reader:
     def _record(
         self, name: str, measured: Measurement, stretch: Stretch
     ) -> tuple[Record, int | None]:
-        """The record of a stretch, and samples that do not count if it is at rest, if it may be."""
+        """Return the record of a stretch, and the samples to skip at rest if its start is open."""
         u, y, r, T = stretch.u, stretch.y, stretch.reference, len(stretch.u)
         assert measured.fs
         seen = y[: self._seen(T)]
@@ -397,7 +399,7 @@ class _Reader:
         return record, rest
 
     def _seen(self, T: int) -> int:
-        """Samples that choose how a record begins: outputs of the test do not."""
+        """Return how many samples may decide how a record begins: test outputs may not."""
         return T - round(T * self.unseen)
 
     def _whole_periods(self, T: int, N: int) -> bool:
@@ -407,7 +409,7 @@ class _Reader:
 
 
 def listed_files(given: Any, option: str) -> list[Path]:
-    """The files of paths and patterns, those of a pattern in the order of people's counting."""
+    """The files of paths and patterns; the files of a pattern in counting order (2 before 10)."""
     several = isinstance(given, Iterable) and not isinstance(given, str | Path)
     listed: list[Any] = [*given] if several else [given]
     if not listed or not all(isinstance(path, str | Path) for path in listed):
@@ -429,7 +431,7 @@ def listed_files(given: Any, option: str) -> list[Path]:
 
 
 def place_of(source: Path | Table) -> Path:
-    """Where it is, or how it is called."""
+    """Return the path of a file, or the name of a table."""
     return source.path if isinstance(source, Table) else source
 
 
@@ -441,7 +443,7 @@ def _counting(text: str) -> list[tuple[int, str]]:
 
 
 def stem_of(path: Path) -> str:
-    """Name of a file without its extension, and of its sheet."""
+    """Name of a file without its extension, followed by its sheet."""
     file, sheet = workbook(path)
     name = file.name
     stem = Path(name[:-3] if name.lower().endswith(".gz") else name).stem
@@ -449,7 +451,7 @@ def stem_of(path: Path) -> str:
 
 
 def _stems(paths: Sequence[Path], taken: Container[str]) -> list[str]:
-    """Names of files, with as many of their folders as make them unlike one another."""
+    """Names of files, with as many of their folders as needed to tell them apart."""
     full = [real(path) for path in paths]
     names = []
     for depth in range(1, max(len(path.parts) for path in full) + 1):
@@ -460,7 +462,7 @@ def _stems(paths: Sequence[Path], taken: Container[str]) -> list[str]:
 
 
 def _name(paths: Sequence[Path]) -> str:
-    """Name of a data set: its file's, or what its files' names begin with."""
+    """Name of a data set: the name of its file, or what the names of its files begin with."""
     if len(paths) == 1:
         return stem_of(paths[0])
     letters = zip(*map(stem_of, paths), strict=False)
@@ -481,7 +483,7 @@ def is_fraction(use: Use) -> TypeGuard[float]:
 def _taken(
     option: str, use: Use, wholes: list[_Whole], reader: _Reader
 ) -> tuple[list[Record], list[_Whole], float]:
-    """Records for a use, those that are left, and the fraction of these that is for it, too."""
+    """Return the records for a use, the remaining records, and the fraction to cut from those."""
     if use is None:
         return [], wholes, 0.0
     if isinstance(use, str | Path | Sequence):
@@ -508,7 +510,7 @@ def _taken(
 def _named(
     option: str, names: Sequence[str | Path], wholes: list[_Whole], reader: _Reader
 ) -> tuple[list[Record], list[_Whole]]:
-    """Records by their names, or of other files, and those that are left."""
+    """Return records by their names or of other files, and the remaining records."""
     left, records = list(wholes), []
     known = list(reader.all)
     for name in names:

@@ -19,7 +19,7 @@ from lfrtorch.files.table import Table
 from lfrtorch.files.time_stamps import is_time, time_unit
 
 _LONGEST = 16
-"""Entries of an array in a message that are channels."""
+"""An array in a message is read as channels if it has at most so many entries."""
 
 _NANOSECONDS = 1e-9
 
@@ -45,7 +45,7 @@ def _reader(read: Read, kind: str) -> Callable[[Path], Table]:
 
 
 def _mdf(path: Path) -> dict[str, Series]:
-    """The channels of an MDF file; one that is called as one before it has its group's number."""
+    """The channels of an MDF file; a name that occurs again is followed by the signal's number."""
     asammdf = optional("asammdf")
     found: dict[str, Series] = {}
     with asammdf.MDF(str(path)) as file:
@@ -66,7 +66,7 @@ def _mdf(path: Path) -> dict[str, Series]:
 
 
 def _tdms(path: Path) -> dict[str, Series | str]:
-    """The channels of all groups, by name, or by group and name if that is not one."""
+    """The channels of all groups, by name, or by group and name if several have that name."""
     nptdms = optional("nptdms")
     found: dict[str, Series | str] = {}
     begins: dict[str, int] = {}
@@ -103,7 +103,7 @@ def _tdms(path: Path) -> dict[str, Series | str]:
                     begins[name] = int(np.datetime64(begin, "us").astype(np.int64))
                 unit = str(told.get("unit_string", ""))
                 found[name] = Series(t, channel[:].astype(np.float64), unit, note)
-    first = min(begins.values(), default=0)  # seconds since 1970 would lose digits
+    first = min(begins.values(), default=0)  # counted from 1970, times would lose digits
     for name, begin in begins.items():
         series = found[name]
         if isinstance(series, Series):
@@ -173,13 +173,13 @@ def _decoder(schema: Any, encoding: str) -> Callable[[bytes], Any]:
 
 
 def _learn(store: Any, definition: str, name: str) -> None:
-    """Let a store of message types know one, and those that it is made of."""
+    """Let a store of message types know a type, and the types that it is made of."""
     known = optional("rosbags.typesys").get_types_from_msg(definition, name)
     store.register({each: one for each, one in known.items() if each not in store.types})
 
 
 def _bag(path: Path) -> dict[str, Series]:
-    """The same of a bag of ROS 2 in sqlite: its folder has metadata.yaml."""
+    """The same for a ROS 2 bag in sqlite, whose folder has metadata.yaml."""
     rosbag2, typesys = optional("rosbags.rosbag2"), optional("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
@@ -232,4 +232,4 @@ READERS: dict[str, Callable[[Path], Table]] = {
     ".db3": _reader(_bag, "ROS 2 bag"),
     **dict.fromkeys((".uff", ".unv"), _reader(_uff, "UFF")),
 }
-"""Readers by extension; ``#50Hz`` behind the path puts all channels on one clock."""
+"""Readers by extension; ``#50Hz`` after the path interpolates all channels to one clock."""

@@ -1,4 +1,4 @@
-"""Variables of a MATLAB file whose elements are whole, before a library in C trusts their tags."""
+"""Variables of a MATLAB file, checked for damage before a C library relies on their tags."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from typing import IO, NamedTuple
 import numpy as np
 
 _HEADER = 128  # bytes
-_PIECE = 1 << 20  # bytes that are in memory at once
+_PIECE = 1 << 20  # bytes in memory at once
 
 _NUMBERS = frozenset((1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18))  # kinds of elements
 _MATRIX, _PACKED = 14, 15
 _FLAT = frozenset(range(4, 16))  # classes of arrays that hold no other arrays
 _SPARSE = 5  # the class of arrays that have fewer numbers than their shape
 _OBJECT = 17  # the class of an object: its name comes next, and no shape
-_HEAD = 128  # bytes of an element that are looked at: shapes have 32 sizes, names 63 letters
+_HEAD = 128  # bytes kept of an element: shapes have at most 32 sizes, names 63 letters
 _DEEPEST = 32
 
 
 class Variable(NamedTuple):
-    """An array or object, and the numbers in it, those of the arrays that it holds among them."""
+    """An array or object, and how many numbers are in it and in the arrays that it holds."""
 
     name: str
     numbers: int
@@ -32,7 +32,7 @@ class Variable(NamedTuple):
 
 
 def variables_in(path: Path) -> list[Variable]:
-    """The variables of a MATLAB 5 file; refuse one whose elements do not lie as the format says."""
+    """The variables of a MATLAB 5 file; refuse a file whose elements break the format."""
     # Source: MATLAB, "MAT-File Format", version 5.
     with path.open("rb") as stream:
         header = stream.read(_HEADER)
@@ -66,7 +66,7 @@ class _Unpacked(io.RawIOBase):
 def _walk(
     stream: IO[bytes], size: int | None, order: str, allowed: frozenset[int], depth: int
 ) -> tuple[list[bytes], list[Variable]]:
-    """The first elements in the next bytes of a stream, or up to its end, and the arrays there."""
+    """Return the first elements of a stream's next bytes (or of the rest), and the arrays there."""
     if depth > _DEEPEST:
         raise ValueError(f"arrays lie more than {_DEEPEST} deep in one another")
     left = size
@@ -79,7 +79,7 @@ def _walk(
             raise ValueError("it is cut off")
         kind, length = struct.unpack(f"{order}II", tag)
         content = b""
-        if kind >> 16:  # a small one, in its tag
+        if kind >> 16:  # a small element, whose value is in its tag
             if kind >> 16 > 4:
                 raise ValueError(f"a small element has {kind >> 16} bytes")
             kind, length, padded, content = kind & 0xFFFF, 0, 0, tag[4 : 4 + (kind >> 16)]
@@ -126,7 +126,7 @@ def _variable(heads: list[bytes], inside: list[Variable], order: str, length: in
 
 
 def _skip(stream: IO[bytes], size: int) -> bytes:
-    """Read over some bytes; the first of them."""
+    """Read over some bytes; return the first of them."""
     start = b""
     while size > 0:
         piece = stream.read(min(size, _PIECE))

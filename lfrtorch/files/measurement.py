@@ -1,6 +1,6 @@
 """Measurement in one file: the roles of its columns, their clock, and signals on an even grid.
 
-:func:`read_measurement` refuses what a model cannot be fitted to; :func:`look_at` takes the
+:func:`read_measurement` refuses what a model cannot be fitted to; :func:`look_at` reads the
 beginning of any file, and says what is odd.
 """
 
@@ -29,7 +29,7 @@ from lfrtorch.files.time_base import OnGrid, TimeBase, find_base, on_grid
 Gaps = Literal["error", "split"]
 
 LARGEST = 2**22
-"""Values that a first look reads, of all channels together."""
+"""Values that :func:`look_at` reads at most, over all channels."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class Stretch(NamedTuple):
 
     u: Array  # (T, nu)
     y: Array  # (T, ny)
-    begins: bool  # whether it is the beginning of a run
-    run: str  # empty if there is one
-    reference: Array | None = None  # (T, nr), if one was asked for
+    begins: bool  # whether it begins a run
+    run: str  # name of the run; empty if the file has only one run
+    reference: Array | None = None  # (T, nr), if wanted
     valid: Booleans | None = None  # (T, ny): False for outputs without a value, interpolated
 
 
@@ -65,12 +65,12 @@ class Measurement:
     """One file."""
 
     path: Path
-    fs: float | None  # Hz, which a first look may not know
+    fs: float | None  # Hz; None if look_at does not find it
     inputs: tuple[Channel, ...]
-    outputs: tuple[Channel, ...]  # of a first look all signals, if none was named
-    stretches: list[Stretch]  # of a first look the longest run, NaN where a value is missing
-    notes: list[str]  # what was taken for what
-    doubts: list[str] = field(default_factory=list)  # what is wrong with the times
+    outputs: tuple[Channel, ...]  # from look_at: all signals, if no inputs or outputs are named
+    stretches: list[Stretch]  # from look_at: the longest run, NaN where a value is missing
+    notes: list[str]  # which columns and which times were assumed
+    doubts: list[str] = field(default_factory=list)  # problems with the time stamps
 
     @property
     def u(self) -> Array:
@@ -93,7 +93,7 @@ class _Roles(NamedTuple):
 
 
 def read_measurement(source: Path | Table, wanted: Wanted) -> Measurement:
-    """Read inputs, outputs and sampling frequency of a file; refuse gaps, unless to be split."""
+    """Read inputs, outputs and sampling frequency of a file; refuse gaps unless they are split."""
     table = source if isinstance(source, Table) else open_table(source)
     (u, y, r, stamps), told = _roles(table, wanted, needed=True)
     columns = (*u, *y, *r, *stamps)
@@ -109,7 +109,7 @@ def read_measurement(source: Path | Table, wanted: Wanted) -> Measurement:
         columns, beside = (*columns, *beside), ()
     try:
         values = table.read((*columns, *beside))
-    except InputError:  # further on than was looked at, what is beside may have words
+    except InputError:  # further down, a time column that is only compared may hold words
         base, beside = base._replace(column=None), ()
         values = table.read(columns)
     values, t = _to_the_end(values, len(columns))
@@ -117,7 +117,7 @@ def read_measurement(source: Path | Table, wanted: Wanted) -> Measurement:
     ends = np.cumsum([0, len(u), len(y), len(r)])
     parts = [slice(a, b) for a, b in pairwise(ends)]
     needed = np.arange(len(columns))
-    if wanted.gaps == "error":  # an output without a value leaves no gap
+    if wanted.gaps == "error":  # an output without a value is not a gap
         needed = np.delete(needed, parts[1])
     missing = np.asarray(np.isnan(values[:, needed]).any(axis=1))
     grid = on_grid(
@@ -144,8 +144,8 @@ def read_measurement(source: Path | Table, wanted: Wanted) -> Measurement:
         sample, i = np.argwhere(empty)[0]
         notes.append(
             f"{empty.sum()} output sample(s) have no value, the first at "
-            f"{table.where(int(sample))} in column {table.headers[y[i]]!r}: they are simulated "
-            "through, and neither fitted nor scored"
+            f"{table.where(int(sample))} in column {table.headers[y[i]]!r}: the model is "
+            "simulated there, but these samples are neither fitted nor scored"
         )
     nu = len(u)
     return Measurement(table.path, grid.fs, channels[:nu], channels[nu:], stretches, notes)
@@ -159,7 +159,7 @@ def look_at(
     time: str | int | None = None,
     fs: float | None = None,
 ) -> Measurement:
-    """Read the first samples of a file; without inputs and outputs, of all signals."""
+    """Read the first samples of a file: of all signals, unless inputs or outputs are given."""
     # If one side is given, the other columns are the other side.
     u, y, base, remarks = _guessed(table, Wanted(inputs, outputs, fs, time))
     columns, doubts = (*u, *y), [base.why] if base.why else []
@@ -177,11 +177,11 @@ def look_at(
     (remarks if fs is None else doubts).extend(base.notes)
     remarks += grid.notes
     if more:
-        remarks.append(f"the first {len(values)} samples are read, and no more")
+        remarks.append(f"only the first {len(values)} samples are read")
     longest = max(grid.pieces, key=lambda run: sum(len(piece.rows) for piece in run))
     name = grid.runs.names[grid.pieces.index(longest)]
     if len(grid.pieces) > 1:
-        remarks.append(f"what follows is of the longest run, {name}")
+        remarks.append(f"the rows below are for the longest run, {name}")
     if grid.holes[0]:
         doubts.append(f"{grid.gap(table)}: data.gaps=split cuts the record there")
     signals = _joined(longest, values[:, : len(columns)], len(u))
@@ -197,7 +197,7 @@ def look_at(
 
 
 def _roles(table: Table, wanted: Wanted, *, needed: bool) -> tuple[_Roles, list[str]]:
-    """Columns that are named, or whose names leave no doubt, and a note on these."""
+    """Return the columns that are named, or whose names leave no doubt, and a note on these."""
     inputs, outputs, told = wanted.inputs, wanted.outputs, list[str]()
     if needed or (inputs is None and outputs is None):
         inputs, outputs, told = table.by_name(inputs, outputs)
@@ -233,7 +233,7 @@ def _roles(table: Table, wanted: Wanted, *, needed: bool) -> tuple[_Roles, list[
 def _guessed(
     table: Table, wanted: Wanted
 ) -> tuple[tuple[int, ...], tuple[int, ...], TimeBase, list[str]]:
-    """Inputs and outputs, what tells their times, and remarks on the choice."""
+    """Return inputs and outputs, what tells their times, and remarks on the choice."""
     (u, y, _, stamps), remarks = _roles(table, wanted, needed=False)
     named = [*u, *y, *stamps]
     if not table.contents:
@@ -286,14 +286,14 @@ def _beginning(table: Table, columns: Sequence[int]) -> tuple[Array, bool]:
 
 
 def _to_the_end(values: Array, count: int) -> tuple[Array, Array]:
-    """The first columns and the last one, without the empty lines that spreadsheets end in."""
+    """The first columns and the last one, without the empty lines at the end of spreadsheets."""
     present = np.flatnonzero(~np.isnan(values[:, :count]).all(axis=1))
     values = values[: present[-1] + 1 if present.size else 0]
     return values[:, :count], values[:, -1]
 
 
 def _joined(pieces: Sequence[Piece], signals: Array, nu: int) -> Array:
-    """The signals of a run on its grid, NaN in its holes as far as these are not too long."""
+    """The signals of a run on its grid, NaN in its holes; the whole length is limited."""
     found, end = [], 0.0
     for piece in pieces:
         hole = min(round(piece.start - end), LARGEST // signals.shape[1]) if found else 0
@@ -308,7 +308,7 @@ def _joined(pieces: Sequence[Piece], signals: Array, nu: int) -> Array:
 def _stretches(
     values: Array, pieces: Sequence[Piece], parts: Sequence[slice], gaps: Gaps, run: str
 ) -> list[Stretch]:
-    """The stretches of a run, without a missing value if they are split."""
+    """The stretches of a run; if gaps are split, without missing values."""
     found = list[Stretch]()
     for piece in pieces:
         signals, lost = piece.on_grid(values), piece.missing()
@@ -344,7 +344,7 @@ def _channels(
     strange = [key for key in units if not any(key in own for own in keys)]
     if strange:
         raise InputError(
-            f"units names {', '.join(map(repr, strange))}, which is none of the inputs and "
+            f"units names {', '.join(map(repr, strange))}, which is not among the inputs and "
             f"outputs: {', '.join(name for name, *_ in keys)}."
         )
     return tuple(
@@ -388,9 +388,7 @@ def _gap(
     if grid.holes[0]:
         said.append(grid.gap(table))
     return InputError(
-        f"'{table.path}': {', and '.join(said)}.\nFill the gaps, or gaps='split' takes every "
-        "stretch between them for a record of its own."
-        + "".join(
-            f" If {table.headers[column]!r} is no time, give it another name." for column in beside
-        )
+        f"'{table.path}': {', and '.join(said)}.\nFill the gaps, or set gaps='split' to make a "
+        "record of every stretch between them."
+        + "".join(f" If {table.headers[column]!r} is not a time, rename it." for column in beside)
     )

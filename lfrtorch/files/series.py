@@ -1,10 +1,10 @@
 """Channels that have their own times, as loggers store them, as a table on even clocks.
 
-Channels that are read together are put on one clock. Even stamps that all of them have are that
-clock. Else it is an even one of their mean rate, where all run, and straight lines join their
-samples; where two neighbours are several steps apart, there is a hole without values (NaN). A
-channel that is logged on change is held between its samples and after the last. Channels of
-different rates are refused together, unless the path ends in a rate for all: ``drive.mf4#50Hz``.
+Channels that are read together are put on one clock. If all of them have the same even stamps,
+these are the clock. Otherwise the clock is even, at their mean rate, over the time in which all of
+them run, and straight lines join their samples. If two neighbouring samples are several steps
+apart, there is a hole without values (NaN). A channel that is logged on change is held between its
+samples and after the last one. Channels of
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ _UNEVEN = 0.01
 """Largest deviation of a time from an even clock, relative to a step."""
 
 _SAME = 0.01
-"""Relative difference of rates that are one."""
+"""Largest relative difference of rates that count as one."""
 
 _HOLE = 5
-"""Steps without a sample that are a hole, and no jitter of messages."""
+"""More steps than this without a sample are a hole; fewer may be jitter of messages."""
 
 _RARE = 0.05
 """Largest part of all steps that are holes."""
 
 _LIKE = 0.2
-"""Largest deviation of a usual step from the median step of a clock, relative to it."""
+"""A step is usual if it differs from the median step of its clock by at most this part."""
 
 _MOST = 0.75
-"""Least part of usual steps of a clock that has a rate."""
+"""A clock has a rate if at least this part of its steps is usual."""
 
 _FEW = 10
-"""Samples that are too few to show a rate."""
+"""Fewer samples than this do not show a rate."""
 
 _SLOWER = 2
-"""Least ratio by which a channel on change is slower than another one."""
+"""A channel logged on change is slower than another one by at least this ratio."""
 
 _FAR = 20
-"""The same ratio for a channel without other signs of that."""
+"""The same ratio for a channel without other signs that it is logged on change."""
 
 
 class Series(NamedTuple):
@@ -64,12 +64,12 @@ class _Clock:
     t: Array
     hole: float
     fs: float  # Hz, the mean between holes
-    group: int  # of clocks of one rate
-    even: bool  # between holes
+    group: int  # number of the group of clocks with the same rate
+    even: bool  # whether it runs evenly between holes
 
 
 class _Channel(NamedTuple):
-    """The values of a channel at the instants of a clock, which others may have, too."""
+    """The values of a channel at the instants of a clock, which channels may share."""
 
     values: Array
     clock: _Clock
@@ -80,7 +80,7 @@ class SeriesTable(Table):
     """Channels by name, with a column of times for each rate; a text says why one is refused."""
 
     def __init__(self, path: Path, file: Path, found: Mapping[str, Series | str]) -> None:
-        # ``path`` may name a rate behind the file.
+        # ``path`` may be the file and a rate.
         self._asked = _asked(str(path)[len(str(file)) + 1 :]) if path != file else None
         ordered = {n: s if isinstance(s, str) else _in_order(s) for n, s in found.items()}
         refused = {name: each for name, each in ordered.items() if isinstance(each, str)}
@@ -139,15 +139,15 @@ class SeriesTable(Table):
         return self._channels[column].clock if column in self._channels else self._longest[column]
 
     def _held(self, columns: Sequence[int]) -> list[int]:
-        """Those of some columns that are logged on change, as the stamps of the others show."""
+        """Those of some columns that are logged on change, judged by the stamps of the others."""
         channels = [i for i in columns if i in self._channels]
         fastest = max(map(self._clock, channels), key=lambda clock: clock.fs, default=None)
         return [i for i in channels if fastest and _on_change(self._channels[i], fastest)]
 
     def _instants(self, columns: Sequence[int], held: Sequence[int]) -> Array:
-        """The samples of columns that are not held, where all of these run and the held have begun.
+        """The instants at which all columns that are not held run, and all held ones have begun.
 
-        Times beside channels are theirs, and alone those of their longest channel.
+        A time column beside channels has their times; alone, those of its longest channel.
         """
         measured = [i for i in columns if i in self._channels] or columns
         running = [i for i in measured if i not in held]
@@ -191,15 +191,15 @@ class SeriesTable(Table):
 
 
 def _asked(text: str) -> float:
-    """The rate that stands behind a file."""
+    """The rate that is asked for after the file's name."""
     fs = rate_behind(text)
     if fs is None:
-        raise InputError(f"'#{text}' behind the file is no rate; write #50Hz, for example.")
+        raise InputError(f"'#{text}' behind the file is not a rate; write #50Hz, for example.")
     return fs
 
 
 def _in_order(series: Series) -> Series | str:
-    """A channel without values that have no time, in its order; or why there is no such order."""
+    """A channel in the order of its times, without values at no time; or why it is refused."""
     t, values = (np.asarray(part, dtype=np.float64) for part in series[:2])
     kept = np.isfinite(t)
     t, values = t[kept], values[kept]
@@ -210,7 +210,7 @@ def _in_order(series: Series) -> Series | str:
             k = int(np.argmax(late))
             return (
                 f"has a clock that is set back, from {t[k - 1]:.10g} s to {t[k]:.10g} s after {k} "
-                "samples; give the parts before and after that apart"
+                "samples; give the parts before and after it as separate files"
             )
         t, first = np.unique(t, return_index=True)
         values = values[first]
@@ -218,7 +218,7 @@ def _in_order(series: Series) -> Series | str:
 
 
 def _clocks(times: Sequence[Array], *, one: bool) -> list[_Clock]:
-    """The clock of each channel; those of one rate are a group, or all."""
+    """The clock of each channel; clocks of one rate are a group, or all are if ``one``."""
     own: list[_Clock] = []
     found = []
     for t in times:
@@ -242,7 +242,7 @@ def _even(t: Array, fs: float, hole: float) -> bool:
 
 
 def _on_change(channel: _Channel, fastest: _Clock) -> bool:
-    """Tell whether a channel is logged on change: at no rate, and more seldom than another."""
+    """Tell whether a channel is logged on change: without a rate, and slower than another one."""
     t, fs = channel.clock.t, channel.clock.fs
     steps = np.diff(t)
     like = np.abs(steps / np.median(steps) - 1) <= _LIKE

@@ -14,11 +14,11 @@ class TooShortError(InputError):
 
 
 def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
-    """Cut a record into parts by use; one whose fraction is 0 is left out."""
-    # Every part begins where the record begins and is simulated from there: only its own samples
-    # are scored, so the transient of the start reaches neither validation nor test. A record in
-    # steady state is cut into whole periods, which are in steady state themselves, and a part with
-    # a measured start begins at its own first output.
+    """Cut a record into parts by use; a use with fraction 0 has no part."""
+    # Every part begins where the record begins and is simulated from there, but only its own
+    # samples are scored, so the transient of the start reaches neither validation nor test. A
+    # record in steady state is cut into whole periods, each in steady state. A part with a measured
+    # start begins at its own first output.
     names = ["train", *["validation"] * bool(validation), *["test"] * bool(test)]
     steady = record.start == "periodic"
     unit = (record.period or record.samples) if steady else 1
@@ -45,7 +45,7 @@ def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
                     "fractions or skip."
                 )
             part = replace(record[:end], start=record.start, skip=first)
-            if record.start == "measured":  # from its own first output
+            if record.start == "measured":  # the part begins at its own first output
                 part = replace(record[begin:end], skip=max(1, first - begin))
         parts[name], begin = part, end
     return parts

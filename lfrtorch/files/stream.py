@@ -1,4 +1,4 @@
-"""A file as a model takes it: its channels found, its samples checked block by block."""
+"""A file as input of a model: its channels are found, its samples checked block by block."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lfrtorch.files.table import Columns, NoColumnError
 from lfrtorch.files.time_base import find_base
 from lfrtorch.files.time_stamps import time_unit
 
-_SAME = 1e-3  # relative difference of sampling frequencies that counts as none: clocks differ
+_SAME = 1e-3  # largest relative difference of two sampling frequencies that count as equal
 
 
 class Block(NamedTuple):
@@ -29,16 +29,16 @@ class Block(NamedTuple):
 
 
 class FileStream:
-    """Inputs of a model in a file, and outputs if it has them.
+    """The inputs of a model in a file, and its outputs if the file has them.
 
     Args:
         path: the file, of any format that ``open_table`` reads.
         u, y: the model's input and output channels.
-        fs: its sampling frequency in Hz.
-        inputs, outputs: their columns. Default: the columns with the names of the channels, and no
+        fs: sampling frequency of the model in Hz.
+        inputs, outputs: columns of the channels. Default: columns with the channels' names, and no
             outputs unless all of them are there.
         time: column of time stamps, which must run evenly at ``fs``.
-        find_time: without ``time``, look for what the file says of its sampling.
+        find_time: without ``time``, look for the sampling frequency in the file.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class FileStream:
         self.u = self._found(inputs, u, "inputs")
         there = {column.name for column in self.table.columns}
         self.missing = [channel.name for channel in y if channel.name not in there]
-        """The model's outputs that are not in the file, by their own names."""
+        """The model's outputs that are missing in the file, by their own names."""
         unmeasured = outputs is None and self.missing
         self.y = () if unmeasured else self._found(outputs, y, "outputs")
         self.times = () if time is None else self.table.find(time, "time")
@@ -73,10 +73,10 @@ class FileStream:
         if time is None and find_time:
             self.times, self.note = self._sampled()
         self.clock = self.table.columns[self.times[0]] if self.times else Channel("sample")
-        """Name and unit of the time stamps; without them, of the sample numbers."""
+        """Name and unit of the time stamps or, without these, of the sample numbers."""
 
     def blocks(self, samples: int = BLOCK) -> Iterator[Block]:
-        """Yield at most ``samples`` samples at a time; an output that is missing in one is NaN."""
+        """Yield at most ``samples`` samples at a time, with NaN for missing outputs."""
         first, seen, seconds = 0, np.empty(0), 0.0
         columns = [*self.times, *self.u, *self.y]
         ends = [len(self.times), len(self.times) + len(self.u)]
@@ -94,14 +94,14 @@ class FileStream:
             times, u, y = np.split(block, ends, axis=1)
             if self.times:
                 times = times * (seconds := seconds or self._seconds(times[:, 0]))
-                # Those of the last block are looked at with those of a short one.
+                # The last stamps of the block before are checked along with those of a short one.
                 seen = np.concatenate([seen[-1000:], times[:, 0]])
                 self._check(seen, first + len(block) - len(seen))
             yield Block(times, u, y)
             first += len(block)
 
     def _sampled(self) -> tuple[tuple[int, ...], str]:
-        """The column of time that the file has, and what it says of its sampling."""
+        """Find the file's column of time, and what it says about the sampling."""
         base = find_base(self.table, [*self.u, *self.y])
         if base.why:
             raise InputError(
@@ -149,7 +149,7 @@ class FileStream:
         return found
 
     def _seconds(self, times: Array) -> float:
-        """The unit of the first time stamps."""
+        """The unit of the first time stamps, in seconds."""
         try:
             return time_unit(times, self.clock).seconds
         except UnevenError as error:
@@ -159,7 +159,7 @@ class FileStream:
             ) from error
 
     def _check(self, times: Array, first: int) -> None:
-        """Refuse time stamps, those of the samples from ``first`` on, that do not run at ``fs``."""
+        """Refuse times of the samples from ``first`` on if they do not run at ``fs``."""
         if len(times) < 2:
             return
         try:

@@ -22,27 +22,28 @@ Columns = str | int | Sequence[str | int]
 """Columns of a table by their names or numbers: one or several."""
 
 BLOCK = 65536
-"""Samples that are in memory at once."""
+"""Samples in memory at once."""
 
 LEAST = 10
-"""Samples that tell a header of numbers above them, and words below, and rows of words at most."""
+"""Samples needed to tell a header of numbers, or words at the end, from them; and the most rows of
+words at the end."""
 
 _CHANNEL = re.compile(r"(.+)\[(\d+)\]")
 _SIDES = {
     "inputs": re.compile(r"(u|uest|in|input)_?(\d*)", re.IGNORECASE),
     "outputs": re.compile(r"(y|yest|out|output)_?(\d*)", re.IGNORECASE),
 }
-"""Names of columns that leave no doubt of their use, with a number if there are several."""
+"""Column names that leave no doubt of their use, each with a number if there are several."""
 
 _Row = TypeVar("_Row")
 
-_ALL, _SOME = 24, 20  # columns: up to which a message names all, and of more
+_ALL, _SOME = 24, 20  # a message names all columns if there are up to 24, else the first 20
 _RATE = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*(k?)Hz", re.IGNORECASE)
 _NAME = 60  # characters of a column's name in a list
 
 
 class NoColumnError(InputError):
-    """A file that has no such column."""
+    """A file that does not have the wanted column."""
 
 
 class Table(ABC):
@@ -50,13 +51,13 @@ class Table(ABC):
 
     Args:
         path: the file.
-        headers: the columns as the file names them; units stand in them in brackets or behind "/".
-        units: units of columns by header, if the file has them apart.
+        headers: the columns as the file names them, with units in brackets or after "/".
+        units: units of columns by header, if the file has them separately.
         arrays: column numbers by the name of an array of several channels.
         refused: why something in the file is not a channel, by its name.
         rates: sampling frequencies in Hz that stand in the file, by their names.
         lengths: samples of each column, if they may differ.
-        clocks: columns of date-times, which are in seconds whatever their headers say.
+        clocks: columns of date-times, which are given in seconds whatever their headers say.
     """
 
     path: Path
@@ -66,7 +67,7 @@ class Table(ABC):
     contents: Sequence[tuple[str, str, str]] = ()
     """Contents of a file of arrays: name, shape and role of each."""
     asked: float | None = None
-    """The rate in Hz that the signals are to be interpolated to, as in ``x.csv#50Hz``."""
+    """The rate in Hz to which the signals are interpolated, as in ``x.csv#50Hz``."""
 
     def __init__(
         self,
@@ -96,12 +97,12 @@ class Table(ABC):
 
     @abstractmethod
     def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
-        """At most ``samples`` samples at a time, (n, len(columns)).
+        """Yield at most ``samples`` samples at a time, (n, len(columns)).
 
         Date-times are in seconds since the first of the file.
 
         Raises:
-            ValueError: a damaged file, columns of different lengths, or text that is no number.
+            ValueError: a damaged file, columns of different lengths, or text that is not a number.
         """
 
     def labels(self, column: int) -> NDArray[Any]:
@@ -112,8 +113,8 @@ class Table(ABC):
             return np.array([])
 
     def without_footer(self, rows: Iterable[_Row], said: Callable[[_Row], str]) -> Iterator[_Row]:
-        """Yield rows without those of words at the end, which a note tells."""
-        # ``said`` returns what a row says that is no sample, nothing of one that is.
+        """Yield rows without the rows of words at the end, which a note names."""
+        # ``said`` returns the text of a row that is not a sample, and nothing for a sample.
         held, words, count = [], "", 0
         for row in rows:
             text = said(row) if count >= LEAST and len(held) < LEAST else ""
@@ -134,22 +135,22 @@ class Table(ABC):
         return not self.lengths or self.lengths[column] == self.lengths[columns[0]]
 
     def where(self, sample: int) -> str:
-        """Place of a sample, as a user finds it."""
+        """Place of a sample, as a user would look for it."""
         return f"sample {sample} (from 0)"
 
     def read(self, columns: Sequence[int]) -> Array:
         """All samples of some columns, (T, len(columns))."""
         T = max((self.lengths[column] for column in columns), default=0) if self.lengths else 0
         self.check_memory(T * len(columns))
-        grown = bytearray()  # grows in place: a list of blocks would be twice in memory at its end
+        grown = bytearray()  # grows in place: joining a list of blocks would need twice the memory
         for block in self.blocks(columns):
             grown += block.tobytes()
             self.check_memory(len(grown) // 8)
         return np.frombuffer(grown, np.float64).reshape(-1, len(columns))
 
     def check_memory(self, numbers: float) -> None:
-        """Refuse what has so many numbers that there is no memory for it with a ValueError."""
-        # Samples are in memory as they were read, as a record, and normalised.
+        """Refuse with a ValueError to read more numbers than there is memory for."""
+        # Samples are in memory three times: as read, as a record, and normalised.
         check_memory(
             3 * 8.0 * numbers,
             f"'{self.path}', of which {numbers:g} numbers are to be read,",
@@ -175,7 +176,7 @@ class Table(ABC):
     def by_name(
         self, inputs: Columns | None, outputs: Columns | None
     ) -> tuple[Columns | None, Columns | None, list[str]]:
-        """Inputs and outputs, those that are not given by the names of columns; and a note."""
+        """Return inputs and outputs, found by column names if not given, and a note on these."""
         given = {"inputs": inputs, "outputs": outputs}
         told = {side: self._told(side) for side in given if given[side] is None}
         if not told or not all(told.values()):
@@ -185,7 +186,7 @@ class Table(ABC):
         return given["inputs"], given["outputs"], [f"{said}, by the names of the columns"]
 
     def _told(self, side: str) -> list[str]:
-        """The columns called as those of a side are: one, or several with a number each."""
+        """The columns named as those of a side: a single one, or several with a number each."""
         found = [match for c in self.columns if (match := _SIDES[side].fullmatch(c.name))]
         alike = len({match[1].lower() for match in found}) == 1
         numbers = {match[2] for match in found}
@@ -233,7 +234,7 @@ class Table(ABC):
         )
 
     def _close(self, wanted: str) -> str | None:
-        """The name without its unit that a word in small letters may be meant for."""
+        """The column name, without unit, that a word in small letters may be meant for."""
         spelt = self.headers, [column.name for column in self.columns]
         names = {of[i].lower(): spelt[1][i] for of in spelt for i in range(len(of))}
         close = difflib.get_close_matches(wanted, names, n=1, cutoff=0.75)
@@ -256,14 +257,14 @@ class Table(ABC):
 
 
 def rate_behind(text: str) -> float | None:
-    """The rate in Hz that stands behind a file, as in ``x.csv#50Hz``; None if it is none."""
+    """The rate in Hz after a file's name, as in ``x.csv#50Hz``; None if the text is not a rate."""
     found = _RATE.fullmatch(text.strip())
     rate = float(found[1]) * (1000.0 if found[2] else 1.0) if found else 0.0
     return rate if 0 < rate < np.inf else None
 
 
 class Clock:
-    """Seconds since the first of date-times that come in blocks; NaN for one that is missing."""
+    """Seconds since the first of date-times that come in blocks; NaN for a missing date-time."""
 
     def __init__(self) -> None:
         self._first: np.datetime64 | None = None

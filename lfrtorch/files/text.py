@@ -1,4 +1,4 @@
-"""A text file as a table, one line a sample, as spreadsheets, loggers and programs write it."""
+"""A text file as a table, one line a sample, as written by spreadsheets, loggers and programs."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from lfrtorch._support.headers import bracketed, is_unit
 from lfrtorch.files.frame import FrameTable
 from lfrtorch.files.table import LEAST, Table
 
-_HEAD = 1 << 18  # characters that tell the layout
+_HEAD = 1 << 18  # characters in which the layout is looked for
 _LONGEST = 1 << 25  # characters of a line
-_MARKS = "#%"  # of comment lines
+_MARKS = "#%"  # first characters of comment lines
 _COMMENT = re.compile(r"^[ \t]*[#%](?!N/?A\b|[A-Z]+/?0?[!?]).*(?:\n|$)", re.MULTILINE)  # no #N/A
 _MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-nan", "<na>", "#na", "-")
-_NUMBER = re.compile(  # in which no digit may be of two parts: that took hours for a million
+_NUMBER = re.compile(  # no digit may match two parts of it: that took hours for a million
     r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE | re.ASCII
 )
 _COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?", re.ASCII)  # a number with a decimal comma
@@ -63,24 +63,24 @@ class Layout:
 
     encoding: str
     delimiter: str
-    comma: bool  # decimal
+    comma: bool  # whether numbers have a decimal comma
     first: int  # line number of the first sample, from 1
     headers: tuple[str, ...]
     units: dict[str, str]
     dates: frozenset[int]  # columns of date-times
     leads: bool  # whether the first column holds numbers or date-times
-    rates: dict[str, float]  # sampling frequencies that the lines above the samples say
+    rates: dict[str, float]  # sampling frequencies in the lines above the samples
     notes: tuple[str, ...]
-    times: frozenset[int] = frozenset()  # columns of times of day, which are in seconds
+    times: frozenset[int] = frozenset()  # columns of times of day, given in seconds
 
 
 class TextTable(FrameTable):
     """A text file (.csv, .tsv, .txt, .dat, .lvm, also as .gz), read by pandas in blocks.
 
-    The delimiter is a tab, ";", ",", "|" or blanks, whichever makes the most cells numbers; the
-    decimal comma is known if the delimiter is another. Lines that begin with # or % are
-    comments. The samples begin where lines of numbers do; the line above names the columns, one of
-    units may stand between, and what is further above is not read.
+    The delimiter is a tab, ";", ",", "|" or blanks, whichever makes the most cells numbers. Numbers
+    may have a decimal comma unless the comma is the delimiter. Lines that begin with # or % are
+    comments. The samples begin at the first line of numbers. The line above names the columns, with
+    a line of units between them at most; lines further above are not read.
     """
 
     def __init__(self, path: Path, layout: Layout | None = None) -> None:
@@ -96,8 +96,8 @@ class TextTable(FrameTable):
 
         layout, beyond = self.layout, len(self.columns)
         dates = layout.dates.intersection(columns)
-        # A line of one more missing value than there are columns, which is no sample, comes first:
-        # pandas takes the number of columns from there.
+        # pandas takes the number of columns from the first line. So a line of missing values, one
+        # more than there are columns, is put before the samples.
         first = layout.delimiter.join(["nan"] * (beyond + 1)) + "\n"
         try:
             for text in self._texts(samples):
@@ -129,11 +129,11 @@ class TextTable(FrameTable):
                 yield found
         except InputError:
             raise
-        except (ValueError, *_DAMAGED) as error:  # pandas says which cell, and not where
+        except (ValueError, *_DAMAGED) as error:  # pandas names the cell, but not its place
             if isinstance(error, ValueError):
                 self._explain(columns)
             raise InputError(
-                f"'{self.path}' is damaged or no text ({brief(error)}); write it again."
+                f"'{self.path}' is damaged or not text ({brief(error)}); write it again."
             ) from error
 
     def labels(self, column: int) -> NDArray[Any]:
@@ -152,7 +152,7 @@ class TextTable(FrameTable):
         return super().where(sample)
 
     def _place(self, number: int) -> str:
-        """Place of a line, as a user finds it."""
+        """Place of a line, as a user would look for it."""
         return f"line {number}"
 
     @contextmanager
@@ -190,7 +190,7 @@ class TextTable(FrameTable):
                     yield line
 
     def _explain(self, columns: Sequence[int]) -> None:
-        """Refuse the first cell that is none of what a sample has."""
+        """Refuse the first cell that a sample cannot have."""
         width = len(self.columns)
         for line in self._lines():
             cells = line.cells
@@ -222,7 +222,7 @@ def _exact(version: str) -> dict[str, Any]:
 
 
 def _bounded(lines: Iterable[str], count: int) -> Iterator[str]:
-    """The next lines, no more than fit into memory."""
+    """The next lines, no more than fit into memory at once."""
     size = 0
     for line in islice(lines, count):
         yield line
@@ -232,7 +232,7 @@ def _bounded(lines: Iterable[str], count: int) -> Iterator[str]:
 
 
 class _Text(io.TextIOWrapper):
-    """Text whose lines end: a packed file of nothing but blanks is one line of gigabytes."""
+    """Text with a limit for lines: a packed file of blanks alone would be one line of gigabytes."""
 
     def __init__(self, path: Path, encoding: str) -> None:
         super().__init__(_bytes(path), encoding, errors="replace")
@@ -243,8 +243,8 @@ class _Text(io.TextIOWrapper):
         line = super().readline(_LONGEST if size < 0 else size)
         if len(line) == _LONGEST and not line.endswith("\n"):
             raise InputError(
-                f"'{self._path}' has a line of more than {_LONGEST} characters; it is no table of "
-                "samples: give one line a sample."
+                f"'{self._path}' has a line of more than {_LONGEST} characters and is not a table "
+                "of samples: give one line a sample."
             )
         return line
 
@@ -254,7 +254,7 @@ def _bytes(path: Path) -> gzip.GzipFile | io.BufferedReader:
 
 
 def _encoding(path: Path) -> str:
-    """UTF-8 or UTF-16 as their marks or their bytes say, else Latin-1."""
+    """The encoding: UTF-8 or UTF-16 if marks or bytes say so, else Latin-1."""
     with _bytes(path) as stream:
         start = stream.read(_HEAD)
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -308,7 +308,7 @@ def _layout(path: Path) -> Layout:
     if not any(line.strip() for line in text):
         raise InputError(f"'{path}' is empty; give a file with data.")
     try:
-        # A blank stands for any number of them; the first of those that do as well is taken.
+        # The delimiter " " stands for any number of blanks; the first of the best ones is taken.
         delimiter, lines = max(
             ((d, list(_split(iter(text), d))) for d in ("\t", ";", ",", "|", " ")),
             key=lambda split: _order(split[0], split[1]),
@@ -321,7 +321,7 @@ def _layout(path: Path) -> Layout:
 
 
 def _bulk(lines: Sequence[Line]) -> list[list[str]]:
-    """Cells of the second half of the lines: samples, but for the longest preambles."""
+    """Cells of the second half of the lines, which are samples unless the preamble is very long."""
     samples = [line.cells for line in lines if not line.comment]
     return samples[len(samples) // 2 :]
 
@@ -356,7 +356,7 @@ def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> L
     def numeric(cell: str) -> bool:
         return _is_number(cell, comma) or _is_date(cell)
 
-    # Columns that hold numbers or nothing, and the first line that is like them.
+    # Columns that hold numbers or nothing, and the first line that fits them.
     given = [[cells[i] for cells in whole if not _is_missing(cells[i])] for i in range(width)]
     most = {i for i, cells in enumerate(given) if 2 * sum(map(numeric, cells)) > len(cells)}
     empty = {i for i, cells in enumerate(given) if not cells}
@@ -375,7 +375,7 @@ def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> L
             f"'{path}' has no samples: no line of numbers follows its first line, "
             f"{shown[:80]!r}; give a file with data."
         )
-    # A number that cannot be read makes no header of its line.
+    # A line of samples does not become a header by one number that cannot be read.
     while start:
         _, cells, comment = lines[start - 1]
         if comment or len(cells) != width or not any(map(numeric, cells)):
@@ -423,7 +423,7 @@ def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> L
 
 
 def _decimal_comma(whole: list[list[str]]) -> bool:
-    """Tell if numbers have a decimal comma: no column has a point, or fewer than have a comma."""
+    """Tell if numbers have a decimal comma: fewer columns have a point than a comma."""
     commas, points, thousands = set(), set(), set()
     for cells in whole:
         for i, cell in enumerate(cells):
@@ -438,8 +438,8 @@ def named_by_numbers(
     cells: Sequence[str], below: Sequence[Sequence[str]], *, comma: bool = False
 ) -> bool | None:
     """Tell if a line is a header with numbers as names; None if it may be a sample."""
-    # It is if these are unlike all samples below, or 0, 1, 2 ... as pandas writes them. It is none
-    # if a column runs on from it, as a time does.
+    # It is if these numbers are unlike all samples below, or are 0, 1, 2 ... as pandas writes them.
+    # It is not if a column runs on from its number, as a time does.
     numbers = {i: int(cell) for i, cell in enumerate(cells) if _WHOLE.fullmatch(cell)}
     words = [cell for i, cell in enumerate(cells) if i not in numbers and (cell or i)]
     if any(_is_missing(word) or not word[0].isalpha() for word in words):
@@ -474,7 +474,7 @@ def _runs_on(number: float, column: Sequence[float]) -> bool:
 
 
 def _interval(lines: Sequence[Line]) -> dict[str, float]:
-    """The sampling frequency by the row Delta_X that LabVIEW writes, if its channels have one."""
+    """The sampling frequency from LabVIEW's row Delta_X, if its channels have the same."""
     rows = [line.cells[1:] for line in lines if line.cells and line.cells[0] == "Delta_X"]
     steps = {step for cells in rows for comma in (False, True) for step in _finite(cells, comma)}
     return {"Delta_X": 1 / steps.pop()} if len(steps) == 1 and 1e-99 < min(steps) < 1e99 else {}
@@ -492,7 +492,7 @@ def _names(above: list[list[str]], width: int) -> tuple[tuple[str, ...], dict[st
     if len(above) > 1 and all(not c or is_unit(c) or bracketed(c) for c in above[-1]):
         *above, units = above
     if len(above) > 1 and _doubled(above[-1]) and not _doubled(above[-2]):
-        above.pop()  # words for units, as "Volt, Volt"
+        above.pop()  # words as units, such as "Volt, Volt"
     names = above[-1] if above else []
     names = names[: max([width, *(i + 1 for i, name in enumerate(names) if name)])]
     headers = tuple(name or f"column {i}" for i, name in enumerate(names)) or tuple(
@@ -520,7 +520,7 @@ def _is_date(cell: str) -> bool:
 
 
 def _is_time(cell: str) -> bool:
-    """Tell if the day exists, too: 2020-02-30 has the form of a date."""
+    """Tell if a cell is a date that exists: 2020-02-30 only has the form of one."""
     import pandas as pd
 
     try:
@@ -535,7 +535,7 @@ def _is_missing(cell: str) -> bool:
 
 
 def with_point(cell: str, *, comma: bool) -> str:
-    """A number with a decimal point; 5,189 may be in thousands, unless commas are decimal."""
+    """A number with a decimal point; 5,189 may mean thousands, unless commas are decimal."""
     decimal = _COMMA.fullmatch(cell) and (comma or not _with_thousands(cell))
     return cell.replace(",", ".") if decimal else cell
 

@@ -1,4 +1,4 @@
-"""Time base of a file's samples: a column, or a number; and the runs in the file."""
+"""Time base of a file's samples: a time column or a sampling frequency; and the runs in it."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from lfrtorch._support.types import Array
 from lfrtorch.files.table import BLOCK, Table
 from lfrtorch.files.time_stamps import THOUSANDTHS, is_time, seconds
 
-_SAME = 1e-3  # relative: sampling frequencies that do not contradict one another
+_SAME = 1e-3  # largest relative difference of sampling frequencies that agree
 
 
 class TimeBase(NamedTuple):
-    """The sampling frequency in Hz, the column that tells times, and notes; None if unknown."""
+    """The sampling frequency in Hz, the time column, and notes; None if unknown."""
 
     fs: float | None
     column: int | None = None
     notes: tuple[str, ...] = ()
     given: bool = False  # whether the user named the column
     named: bool = True  # whether a name says that it is the time
-    others: tuple[int, ...] = ()  # columns that are named as time is, too
-    why: str = ""  # a column that is named as time is none
+    others: tuple[int, ...] = ()  # further columns that are named as time is
+    why: str = ""  # why a column that is named as time is not a time
 
 
 class OnGrid(NamedTuple):
@@ -42,7 +42,7 @@ class OnGrid(NamedTuple):
 
     @property
     def holes(self) -> tuple[int, int, int]:
-        """Number of gaps, number of missing samples in them, and the first row behind one."""
+        """Number of gaps, number of samples missing in them, and the first row after a gap."""
         found = [
             (int(b.rows[0]), round(b.start - a.start - a.places[-1]) - 1)
             for run in self.pieces
@@ -74,11 +74,11 @@ class _Found(NamedTuple):
 def find_base(
     table: Table, used: Sequence[int], *, fs: float | None = None, stamps: Sequence[int] = ()
 ) -> TimeBase:
-    """Return what tells the times of a file of which columns ``used`` are something else.
+    """Return what tells the times of a file; columns ``used`` are something else.
 
-    It is the column that the user names, else one that is named as time is; a lone number like
-    ``Fs``; the first other column that rises evenly. Given ``fs`` it is a column named as time is
-    that runs at that rate, in some unit. Two that contradict one another are refused.
+    It is the column that the user names, else a column that is named as time is; else a lone number
+    like ``Fs``; else the first other column that rises evenly. If ``fs`` is given, it is a column
+    named as time is that runs at that rate, in some unit. Two that contradict are refused.
     """
     if stamps:
         return TimeBase(fs, stamps[0], given=True)
@@ -114,7 +114,7 @@ def find_base(
 
 
 def _beside(table: Table, named: Sequence[_Found], fs: float) -> TimeBase:
-    """The column that runs at a rate that is given, and what contradicts it."""
+    """Find the column that runs at the given rate, and note what contradicts it."""
     notes, agree = [], [found.column for found in named if _agrees(fs, found)]
     for column, even in named:
         rate = even.grid.fs
@@ -136,7 +136,7 @@ def _beside(table: Table, named: Sequence[_Found], fs: float) -> TimeBase:
 
 
 def _agrees(fs: float, found: _Found) -> bool:
-    """Tell whether a column runs at a rate, if it is in ms, us or ns, too."""
+    """Tell whether a column runs at a rate, if its unit may also be ms, us or ns."""
     return abs(fs / found.fs / _thousands(fs / found.fs) - 1) <= found.even.tolerance
 
 
@@ -149,12 +149,12 @@ def _called(table: Table, column: int) -> str:
 
 
 def _first(table: Table, columns: Sequence[int], samples: int) -> dict[int, Array]:
-    """The first samples of the columns that are numbers, read together as far as possible."""
+    """The first samples of the columns that hold numbers, read together as far as possible."""
     if not columns:
         return {}
     try:
         block = next(table.blocks(columns, samples), np.empty((0, len(columns))))
-    except ValueError:  # no numbers, in some of them
+    except ValueError:  # some of the columns do not hold numbers
         half = len(columns) // 2
         return _first(table, columns[:half], samples) | (
             _first(table, columns[half:], samples) if half else {}
@@ -165,7 +165,7 @@ def _first(table: Table, columns: Sequence[int], samples: int) -> dict[int, Arra
 def _columns(
     table: Table, used: Sequence[int], *, named: bool
 ) -> tuple[list[_Found], list[tuple[int, UnevenError]]]:
-    """Find times among the columns that are not measured, and why others are none."""
+    """Find times among the columns that are not signals, and why others are not times."""
     usual = [length for length, _ in Counter(table.lengths).most_common(1)]
     with_them = used or [i for i, length in enumerate(table.lengths) if [length] == usual][:1]
     measured = set(used)
@@ -178,7 +178,7 @@ def _columns(
     ]
     reasons: dict[int, UnevenError] = {}
     found: dict[int, _Found] = {}
-    # A few samples show of most columns that they are no grid of time.
+    # For most columns, a few samples show that they are not evenly rising times.
     for samples in (BLOCK,) if named else (1000, BLOCK):
         found.clear()
         for column, t in _first(table, left, samples).items():
@@ -209,11 +209,11 @@ def on_grid(
     """Put the samples of a file on an even grid, run by run.
 
     Args:
-        base: source of their times.
-        T: samples.
-        t: (T,), as they stand in the column of times.
+        base: source of the samples' times.
+        T: number of samples.
+        t: (T,), as they are in the column of times.
         fs: sampling frequency in Hz that the user gave.
-        used: columns that number no run.
+        used: columns that cannot be run numbers.
         whole: every missing sample is a hole, see :func:`even_times`.
     """
     times, unit = np.arange(T) / base.fs if table.asked and base.fs else None, ""
@@ -228,7 +228,7 @@ def on_grid(
     except UnevenError as error:
         wrong = "give fs without time if the column is wrong"
         if fs is not None and not base.given:
-            wrong = "give the column another name if it is no time"
+            wrong = "give the column another name if it is not a time"
         raise InputError(
             f"'{table.path}': the time {_uneven(table, base, error)}; {error.remedy}, or {wrong}."
         ) from error
@@ -249,7 +249,7 @@ def _at_times(
     *,
     whole: bool,
 ) -> OnGrid:
-    """The samples at the places that their times tell."""
+    """Place the samples by their times."""
     parts = [slice(a, b) for a, b in pairwise([*map(int, runs.starts), len(times)])]
     own = [_even(times, part, None, whole=whole) for part in parts]
     longest = max(own, key=lambda even: sum(len(piece.rows) for piece in even.pieces))
@@ -286,7 +286,7 @@ def _at_times(
             count = sum(int(each.missing().sum()) for each in pieces)
             notes.append(
                 f"{count} sample(s) are missing between the others, the first before "
-                f"{table.where(int(row))}: inputs are interpolated there, and outputs neither "
+                f"{table.where(int(row))}: inputs are interpolated there, outputs are neither "
                 "fitted nor scored"
             )
             break
@@ -294,7 +294,7 @@ def _at_times(
 
 
 def _even(times: Array, part: slice, fs: float | None, *, whole: bool) -> EvenTimes:
-    """The places of a run's samples, rows and reasons counted from the first of the file."""
+    """The places of a run's samples; rows and reasons count from the first sample of the file."""
     try:
         even = even_times(times[part], fs, whole=whole)
     except UnevenError as error:

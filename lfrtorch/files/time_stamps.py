@@ -26,19 +26,19 @@ _UNITS = (
     (86400.0, "days", "d day tag tage"),
     (1e3, "kiloseconds", "ks kilosecond"),
 )
-"""Units of time: seconds, name, and spellings without an ending."""
+"""Units of time: seconds, name, and spellings without endings such as the plural s."""
 
 _SECONDS = {spelling: one for one, _, spellings in _UNITS for spelling in spellings.split()}
 _KNOWN = "s, ms, us, ns, min, h or d"
 
 THOUSANDTHS = {one: name for one, name, _ in _UNITS[2::-1]}
-"""Units that stamps count in without saying it, by their seconds."""
+"""Units in which stamps may count without naming them, by their seconds."""
 
 _SINCE_1970 = (1e9, 4e9)  # seconds: the years 2001 to 2096
 
 
 class TimeUnit(NamedTuple):
-    """A unit of time in seconds, and what it is if the file does not say it."""
+    """A unit of time in seconds, and its name if it is assumed, as the file does not name it."""
 
     seconds: float
     assumed: str = ""
@@ -50,13 +50,13 @@ def is_time(channel: Channel) -> bool:
 
 
 def time_unit(t: Array, channel: Channel) -> TimeUnit:
-    """Return the unit of time stamps, which header or size tells; refuse what may be several."""
+    """Return the unit of time stamps, from header or size; refuse stamps with several choices."""
     written = _named(channel)[1]
     if written:
         seconds = _seconds(written)
         if seconds is None:
             raise UnevenError(
-                f"has the unit {written!r}, which is none of time ({_KNOWN})", 0, "correct it"
+                f"has the unit {written!r}, which is not a unit of time ({_KNOWN})", 0, "correct it"
             )
         return TimeUnit(seconds)
     known = t[np.isfinite(t)]
@@ -88,7 +88,7 @@ def time_unit(t: Array, channel: Channel) -> TimeUnit:
 
 
 def seconds(t: Array, channel: Channel) -> tuple[Array, str]:
-    """Time stamps (T,) in s, those that are missing filled in, and a unit that is assumed."""
+    """Time stamps (T,) in s, with missing ones filled in, and the unit if it is assumed."""
     unit, known = time_unit(t, channel), np.flatnonzero(np.isfinite(t))
     if not known.size:
         raise UnevenError("has no values", 0)

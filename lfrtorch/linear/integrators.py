@@ -60,7 +60,7 @@ def integrators_of(integrators: int | Sequence[int], ny: int) -> tuple[int, ...]
 def without_limits(record: Record, integrates: Bool[Booleans, " ny"]) -> Record:
     """Return a record whose integrating outputs are not valid where they are at a limit.
 
-    The distance of an output beyond its limit is not known, so that its differences are not, either.
+    The distance of an output beyond its limit is not known, and neither are its differences.
     """
     if record.limits is None or record.start == "periodic":
         return record

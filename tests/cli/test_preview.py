@@ -264,7 +264,7 @@ def test_a_column_of_text_is_left_out(tmp_path: Path, run):
 def test_only_the_beginning_of_a_long_file_is_read(file: Path, run, monkeypatch):
     monkeypatch.setattr(measurement, "LARGEST", 3 * 700)
     out = run(file, "data.inputs=[force]", "data.outputs=[level]")
-    assert "the first 700 samples are read, and no more" in out
+    assert "only the first 700 samples are read" in out
     assert f"{file}: 700 samples" in out
     monkeypatch.setattr(measurement, "LARGEST", 3 * T)
     assert "no more" not in run(file, "data.inputs=[force]", "data.outputs=[level]")

@@ -814,7 +814,7 @@ def test_hdf5_opens_no_other_file_and_no_circle(tmp_path, matlab):
     for name, reason in {
         "other": "lies in another file, 'fifo'", "gone": "leads nowhere", "itself": "leads nowhere",
         "raw": "its numbers in other files", "virtual": "its numbers in other files",
-        f"rig{'.' if matlab else '/'}loop": "a group that it lies in itself",
+        f"rig{'.' if matlab else '/'}loop": "a group inside itself",
     }.items():  # fmt: skip
         refused(table, name, reason)
 

@@ -231,7 +231,7 @@ def test_units(tmp_path, signals):
     assert data.train[0].outputs == (Channel("y", "m"),)
     data = load_records(path, **USE, units={0: "V", 2: "m"})
     assert [c.unit for c in (*data.train[0].inputs, *data.train[0].outputs)][::2] == ["V", "m"]
-    refused("units names 'v'.*none of the inputs and outputs: u1, u2, y", path, units={"v": ""})
+    refused("units names 'v'.*not among the inputs and outputs: u1, u2, y", path, units={"v": ""})
 
 
 # --- several files --------------------------------------------------------------------------
@@ -516,7 +516,7 @@ def test_rows_that_are_lost_are_refused_if_the_rate_is_given_too(tmp_path):
     values = lost_and_doubled(tmp_path)
     use: dict[str, Any] = BARE | {"fs": 100.0, "validation": 0, "test": 0}
     message = refused(r"6 gap\(s\) of 42 sample\(s\) in all", tmp_path / "lost.csv", use=use)
-    assert message.endswith("If 't' is no time, give it another name.")
+    assert message.endswith("If 't' is not a time, rename it.")
     data = load_records(tmp_path / "lost.csv", **use, gaps="split")
     assert [r.samples for r in data.train] == [400, *[393] * 5, 593]
     assert np.array_equal(joined(data.train[-1]), values[-593:])
@@ -550,7 +550,7 @@ def test_a_unit_of_time_that_is_assumed_is_said(tmp_path):
     (note,) = data.notes
     assert note.endswith("'stamp' is taken for the time in milliseconds since 1970, 100 Hz")
     write(path, np.column_stack([np.arange(300) / 100, values]), "t [Ms],u,y")
-    refused("the column 't .Ms.' has the unit 'Ms', which is none of time", path,
+    refused("the column 't .Ms.' has the unit 'Ms', which is not a unit of time", path,
             use=BARE)  # fmt: skip
 
 

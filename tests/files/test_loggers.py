@@ -147,7 +147,7 @@ def test_channels_by_name_at_their_rate(
     ).tests[0]
     assert (slow.fs, slow.samples, slow.name) == (pytest.approx(10.0), 60, path.stem + "_10Hz")
     np.testing.assert_allclose(slow.y[:, 0], slow.y[:, 1], atol=1e-8)
-    with pytest.raises(InputError, match="'#fast' behind the file is no rate"):
+    with pytest.raises(InputError, match="'#fast' behind the file is not a rate"):
         load_records(f"{path}#fast", inputs="Torque", outputs="Speed")
 
 
@@ -376,7 +376,7 @@ def test_rates_in_messages_are_rates_behind_files(tmp_path: Path):
     for rate in ("51200Hz", "5.12e4Hz", "5.12E+04 Hz", "51.2kHz"):
         assert all_of(f"{path}#{rate}").tests[0].fs == pytest.approx(51200)
     for rate in ("1.2.3Hz", "0Hz", "1e999Hz", "eHz", ".Hz"):
-        with pytest.raises(InputError, match="is no rate"):
+        with pytest.raises(InputError, match="is not a rate"):
             all_of(f"{path}#{rate}")
     with pytest.raises(InputError, match=r"takes .* of memory"):
         open_table(f"{path}#1.7e308Hz").read([1, 2])

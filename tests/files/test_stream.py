@@ -82,7 +82,7 @@ def test_columns_that_cannot_be(file: Path, tmp_path: Path):
     other = csv(tmp_path / "b.csv", **{"u1 (kN)": Y, "u2": Y})
     refused("column u1 (kN) of", other)
     refused("is in another unit than the model's u1 (N); convert it", other)
-    refused("the time column y (mm) has the unit 'mm', which is none of time", file, time="y")
+    refused("the time column y (mm) has the unit 'mm', which is not a unit of time", file, time="y")
     refused("the time column u2 does not rise", file, inputs=[3, 3], time="u2")
 
 

@@ -40,7 +40,7 @@ def test_units_of_time_and_their_spellings(units, each):
 
 @pytest.mark.parametrize("unit", ["Ms", "MS", "m", "V", "samples", "-", "UTC"])
 def test_other_units_are_refused(unit):
-    with pytest.raises(UnevenError, match=f"has the unit '{unit}', which is none of time"):
+    with pytest.raises(UnevenError, match=f"has the unit '{unit}', which is not a unit of time"):
         column_sampling(T, Channel("time", unit))
 
 
