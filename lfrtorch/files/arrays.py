@@ -117,8 +117,7 @@ class ArrayTable(Table):
     Time runs along the axis of an array that is as long as a vector of the file. If two axes are,
     or none, it runs along the longer one. An array u of k channels has the columns u1 .. uk, an
     array of one channel the column u. A lone number with the name of a sampling frequency or time
-    is a rate. channel the column u. A lone number with the name of a sampling frequency or time is
-    a rate.
+    is a rate.
     """
 
     def __init__(self, path: Path, found: Mapping[str, Signal | str], stored: Stored) -> None:
