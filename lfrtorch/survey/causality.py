@@ -5,8 +5,9 @@ Syu / Suu with averaged cross spectra. A causal system has its energy at lags �
 output are exchanged, the energy is at negative lags; or at both, if the sampled system has
 feedthrough or its signals are band-limited, and then the response from output to input is causal.
 
-The dead time is the largest number of first lags without which past inputs explain the output as
-well, beside its own past, which stands for a response longer than the lags and for coloured noise.
+The dead time is the largest number of first lags that can be left out: without them, past inputs
+explain the output as well. The output's own past is a regressor, too, for a response longer than
+the lags and for coloured noise.
 """
 
 from __future__ import annotations
@@ -18,18 +19,19 @@ import scipy
 
 from lfrtorch._support.types import Array, Complex
 
-# Numbers of segments of a record, for lags up to T / 8 or T / 16. The one that explains more of the
-# output is taken: short segments miss long memories and delays, few segments average little.
+# Numbers of segments of a record, for lags up to T / 8 or T / 16. The number that explains more of
+# the output is taken: short segments miss long memories and delays, few segments average little.
 _SEGMENTS = (4, 8)
 _SHORTEST, _LONGEST = 32, 16384  # samples of a segment
-_FLOOR = 1e-2  # added to the input's power, relative: without power the response is 0
+_FLOOR = 1e-2  # added to the input's power, relative: where it has no power the response is 0
 
-# Samples of the output's past, lags after the response's peak, and samples that tell a dead time.
+# Past samples of the output, lags after the response's peak, and samples that a dead time is from.
 _PAST, _LATER, _MOST = 10, 30, 20_000
 
-# Lags that do nothing explain so much of the output with this CHANCE; those in the next quarter of
-# a dead time explain CLEAR times as much, while a slow response rises little by little. Past inputs
-# that leave less than NEW of the present one's power, as of a band, can stand for it.
+# If lags do nothing, they explain so much of the output with probability CHANCE. The lags after a
+# dead time, over a quarter of it, explain CLEAR times as much; a slow response rises gradually. If
+# past inputs predict the present one to within NEW of its power, as in a narrow band, they can
+# stand for it.
 _CHANCE, _CLEAR, _NEW = 1e-3, 4.0, 1e-3
 
 
@@ -39,11 +41,11 @@ class TwoSidedResponse(NamedTuple):
     coherence: float  # share of the output's power that follows from the input, linearly
     chance: float  # coherence that unrelated signals would show
     # (E₊ - E₋) / (E₊ + E₋) of the energies at positive and negative lags: 1 for a system with
-    # memory, 0 for one without, -1 for a response that comes first.
+    # memory, 0 for a system without, -1 for a response before its input.
     causality: float
-    reverse: float  # the same from output to input
+    reverse: float  # the causality from output to input
     rise: float  # gain of the reverse response in the upper third of y's frequencies over the lower
-    peak: int  # lag of its largest value
+    peak: int  # lag of the response's largest value
 
 
 def two_sided_response(u: Array, y: Array) -> TwoSidedResponse | None:
@@ -56,9 +58,9 @@ def two_sided_response(u: Array, y: Array) -> TwoSidedResponse | None:
 
 
 def dead_time(u: Array, y: Array, peak: int) -> int:
-    """Return the samples that an output (T,) waits for an input (T,), beside the usual first one.
+    """Return the samples by which an output (T,) lags an input (T,), beyond the usual one.
 
-    It is 0 where that is not clear.
+    It is 0 if a dead time is not clear.
 
     Args:
         peak: lag of the largest value of the response.

@@ -1,9 +1,10 @@
 """Changes within a record: of the gain from inputs to an output, and of the output's delay.
 
-A linear model of the first third of the record is simulated over all of it. It is scaled to fit the
-output up to each sample k, and from there on with a gain of its own, and shifted by one sample,
-too. If it explains both parts, and without the change far less of the second, the gain changes at
-k, or a sample is lost there. A model of the last third must find the same in reverse time.
+A linear model of the first third of the record is simulated over all of it. The simulation is
+scaled to fit the output up to each sample k, and after k with a second gain, also shifted by one
+sample. The gain changes at k, or a sample is lost there, if this explains both parts, and the
+second part far better than without the change. A model of the last third must find the same in
+reverse time.
 
 A nonlinear system has another gain at another level, so a gain counts only if the inputs have
 the same levels in both parts.
@@ -18,21 +19,22 @@ import scipy
 
 from lfrtorch._support.types import Array
 
-# A model of a third of the record has PAST outputs and up to LAGS inputs, at most one a SHARE of
-# its samples, of which there are LEAST to MOST.
+# A model of a third of the record has PAST outputs and up to LAGS inputs, at most one for each
+# SHARE samples. It is fitted to LEAST to MOST samples.
 _PAST, _LAGS, _SHARE, _LEAST, _MOST = 10, 100, 10, 100, 20_000
 _RIDGE = 1e-10  # added to the power 1 of a regressor: the past may tell the present
 
-# A change leaves at most LEFT of the variance of each part, and of the second CLEAR of what is left
-# without it. Either part has more than EDGE of the record, whose start the simulation may miss.
+# A change leaves at most LEFT of the variance of each part unexplained, and in the second part at
+# most CLEAR of what is left without the change. Either part has more than EDGE of the record, as
+# the simulation may miss its start.
 _LEFT, _CLEAR, _EDGE = 0.1, 0.3, 0.1
-_NEAR = 0.02  # most difference of the samples that the two models find, over all samples
-_RATIO = 1.5  # least ratio of two gains
-_LEVELS, _ALIKE = (0.05, 0.5, 0.95), 0.5  # quantiles of an input, and most change over its rms
+_NEAR = 0.02  # largest difference of the samples that the two models find, over all samples
+_RATIO = 1.5  # smallest ratio of two gains that counts as a change
+_LEVELS, _ALIKE = (0.05, 0.5, 0.95), 0.5  # quantiles of an input; their largest change, over rms
 
 
 class Change(NamedTuple):
-    """Sample of a change, the gain after it over that before, and the shift after it."""
+    """Sample of a change, the gain after it over the gain before, and the shift after it."""
 
     sample: int
     ratio: float
@@ -59,7 +61,7 @@ def change(u: Array, y: Array) -> Change | None:
 
 
 def _change(u: Array, x: Array, y: Array) -> Change | None:
-    """Return the change of an output (T,) after a first part that x (T,) is the response of."""
+    """Return the change of an output (T,), whose response to the inputs is x (T,) at first."""
     edge = int(_EDGE * len(y))
     before, same = _fits(x, y), _fits(x[::-1], y[::-1])[:, ::-1]
     best, found = np.inf, None
@@ -80,7 +82,7 @@ def _change(u: Array, x: Array, y: Array) -> Change | None:
 
 
 def _simulated(u: Array, y: Array, part: slice) -> Array | None:
-    """Response (T,) to inputs (T, nu) of a linear model fitted to a part, None if it blows up."""
+    """Response (T,) to inputs (T, nu) of a linear model of one part; None if it is unstable."""
     v, x = u[part][:_MOST], y[part][:_MOST]
     mean, level = v.mean(axis=0), x.mean()
     lags = min(_LAGS, max(1, len(x) // (_SHARE * u.shape[1])))
@@ -99,7 +101,7 @@ def _simulated(u: Array, y: Array, part: slice) -> Array | None:
 
 
 def _fits(x: Array, y: Array) -> Array:
-    """Fits of g x + c to the first samples of y (T,): squares left and of y, g, those of x."""
+    """Fit g x + c to the first samples of y (T,): squares left, squares of y, g, squares of x."""
     n, x, y = np.arange(1, len(x) + 1), x - x.mean(), y - y.mean()
     xx, xy, yy = (
         np.cumsum(p * q) - np.cumsum(p) * np.cumsum(q) / n for p, q in ((x, x), (x, y), (y, y))

@@ -1,16 +1,17 @@
-"""Test for an output that integrates the inputs, by spectra at the lowest frequencies excited.
+"""Test for an output that integrates the inputs, by spectra at the lowest excited frequencies.
 
-If it integrates n times, its n-th difference V follows the inputs U there with a real gain that
-does not change with frequency. In any other stable system that gain is imaginary and rises, or
-belongs to a resonance and changes quickly. A fit of first order tells how soon the system forgets,
+If an output integrates n times, its n-th difference V follows the inputs U at these frequencies
+with a real gain that does not change with frequency. In any other stable system that gain is
+imaginary and rises, or belongs to a resonance and changes quickly. A fit of first order, over a few
+more lines, tells how soon the system forgets:
 
     V + a V / jω = (b + jω c) U,
 
-over a few lines more: its time constant is 1 / a.
+its time constant is 1 / a.
 
-An output that is the integral of another output, as a position is of a speed, shows that without a
-spectrum: its change over a stretch is a multiple of the other's integral. It is so of a mass on a
-spring, too. Without a spring the response to the inputs grows towards the lowest frequencies.
+An output that is the integral of another output, as a position is of a speed, shows this without a
+spectrum: its change over a stretch is a multiple of the other output's integral. A mass on a spring
+shows it, too; without a spring the response to the inputs grows towards the lowest frequencies.
 """
 
 from __future__ import annotations
@@ -19,37 +20,38 @@ import numpy as np
 
 from lfrtorch._support.types import Array, Complex
 
-_SHORTEST = 100  # samples of a record that can tell
+_SHORTEST = 100  # samples of the shortest record that is tested
 
-# The first excited line is at most this one. Two integrators need a lower one: above its resonance
-# a mass on a spring looks like a free one.
+# Number of the first excited line at most, by number of integrators. Two need a lower line: above
+# its resonance a mass on a spring looks like a free mass.
 _LOWEST = {1: 12, 2: 4}
 _EXCITED, _STRONG = 1e-3, 1e-2  # power of the first excited line, and of those in the fit, relative
 
-# In the lower band V has the coherence COHERENT with the inputs and phases of at most REAL degrees;
-# in the upper band, where friction distorts, the coherence UPPER. Its size relative to the inputs'
+# In the lower band V has coherence COHERENT with the inputs and phases of at most REAL degrees; in
+# the upper band, where friction distorts, coherence UPPER. The ratio of its size to the inputs'
 # differs between the bands by at most the factor EVEN.
 _COHERENT, _REAL, _UPPER, _EVEN = 0.95, 25.0, 0.4, 0.6
 
-# The fit has LINES lines for each input and more, and tells if it explains FITTED of them. Then it
-# is an integrator if the record is shorter than FORGETS time constants, b alone explains 1 ± GAIN
-# of the lowest lines, and c is at most LAG of it there.
+# The fit has LINES lines and more for each input, and is conclusive if it explains FITTED of them.
+# The output then integrates if the record is shorter than FORGETS time constants, b alone explains
+# 1 ± GAIN of the lowest lines, and c is at most LAG of it there.
 _LINES, _FITTED, _FORGETS, _GAIN, _LAG = 12, 0.75, 3.0, 0.5, 0.3
 
-# A change of an output over one of so many stretches has this correlation with its rate's integral.
+# Over one of so many stretches, the change of an output has this correlation with the integral of
+# its rate.
 _STRETCHES, _ALIKE = 200, 0.95
 
-# Place, speed and acceleration of any mass are so many; more are those of one without a spring.
+# Position, speed and acceleration of any mass are linked; more outputs show a mass without spring.
 _LINKED = 3
 
-# Power of the response in the first band over that in the second: 28 of an integrator under a white
-# input, 1 of a spring.
+# Smallest ratio of the response's power in the first band to the second: an integrator with a white
+# input has 28, a spring 1.
 _BANDS, _GROWS = (slice(1, 5), slice(5, 17)), 14.0
 
 
 def integrators(u: Array, y: Array) -> int:
     """Return how many integrators, 0, 1 or 2, lie between inputs (T, nu) and an output (T,)."""
-    # A system that forgets more slowly than in a third of the record counts as one that integrates.
+    # A system with a time constant longer than a third of the record counts as integrating.
     T, u = len(y), u[:, np.ptp(u, axis=0) > 0]
     if T < _SHORTEST or np.ptp(y) == 0 or not u.size:
         return 0
@@ -68,7 +70,7 @@ def integrators(u: Array, y: Array) -> int:
 
 
 def rates(y: Array) -> list[int | None]:
-    """Return for each output of y (T, ny) the number of that which is its rate, if there is one."""
+    """Return for each output of y (T, ny) the number of the output that is its rate, or None."""
     T, ny = y.shape
     if T < _SHORTEST:
         return [None] * ny
@@ -98,7 +100,7 @@ def grows(u: Array, y: Array) -> bool:
 
 
 def chain(rate: list[int | None]) -> tuple[int, int] | None:
-    """Return an output and its rate, if that is the integral of one that is an integral, too."""
+    """Return an output and its rate, if the rate is an integral as well."""
     for i in range(len(rate)):
         linked: list[int] = [i]
         while (j := rate[linked[-1]]) is not None and j not in linked:

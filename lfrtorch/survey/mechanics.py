@@ -6,29 +6,29 @@ import numpy as np
 
 from lfrtorch._support.types import Array
 
-_LAGS = 20  # past samples that predict the next one, fewer in short records
-_MOST, _FEWEST = 20_000, 300  # samples that are looked at, the first ones of a long record
+_LAGS = 20  # past samples that predict the next one; fewer in short records
+_MOST, _FEWEST = 20_000, 300  # samples that are used, the first ones of a long record
 
-# The input reacts if past surprises of the output explain REACTS of the input's own, and CHANCE
-# times what they would by chance, and in either half of the record HALF of it: a controller acts
-# all the time, a sensor that froze or samples out of order do not. An input whose surprises are
-# below FORESEEN of it is planned.
+# The input reacts if past surprises of the output explain REACTS of the input's own surprises, and
+# CHANCE times what they would by chance, and in either half of the record HALF of it. A controller
+# acts all the time; a frozen sensor or samples out of order do not. An input whose surprises are
+# below FORESEEN of its rms is planned.
 _REACTS, _CHANCE, _HALF, _FORESEEN = 0.03, 5.0, 0.5, 1e-3
 _WINDOWS, _SPAN = (1, 3, 10, 30, 100), 40  # samples of a moving mean; SPAN of them in a record
 
-# Friction is dry if the direction of motion, beside position, speed and acceleration, leaves at
-# most LEFT of what they leave of the force, and EXPLAINED or more is explained.
+# Friction is dry if position, speed and acceleration with the direction of motion explain EXPLAINED
+# of the force, and leave at most LEFT of what they leave without the direction.
 _EXPLAINED, _LEFT = 0.9, 0.6
-_LEVELS = 16  # steps of an input of so few values turn the motion: no sign of friction
+_LEVELS = 16  # an input of so few values turns the motion by its steps: not a sign of friction
 
 
 def reacting(u: Array, y: Array, *, feedthrough: bool = True) -> Array:
     """Return the part of each input's surprises that the outputs' past surprises explain.
 
-    A surprise is what is left of a prediction from past samples. Inputs of an experiment without
+    A surprise is what a prediction from past samples leaves. Inputs of an experiment without
     feedback do not depend on the noise of the outputs; what chance explains counts as 0. A
-    controller that acts in the same sample alone is seen only if ``feedthrough`` is False, so that
-    the input does not act on the output at once: a system where it does looks like it.
+    controller that acts only in the same sample is found only if ``feedthrough`` is False, which
+    says that the input does not act on the output at once: a system with feedthrough looks alike.
 
     Shape:
         u: (T, nu), y: (T, ny) -> (nu,).
@@ -45,7 +45,7 @@ def reacting(u: Array, y: Array, *, feedthrough: bool = True) -> Array:
 
 
 def _explained(u: Array, y: Array, feedthrough: bool) -> tuple[Array, float]:
-    """Part of each input's surprises (nu,) that the outputs' explain, and the least that counts."""
+    """Part (nu,) of each input's surprises that the outputs explain, and the least that counts."""
     T, nu, ny = len(u), u.shape[1], y.shape[1]
     n = min(_LAGS, T // (10 * max(1, nu + ny)))
     none = np.zeros(nu)
@@ -53,7 +53,7 @@ def _explained(u: Array, y: Array, feedthrough: bool) -> tuple[Array, float]:
         return none, 1.0
     u, y = ((s - s.mean(axis=0)) / np.maximum(s.std(axis=0), 1e-300) for s in (u, y))
     e = _left(y[n:], u[n:, : nu * feedthrough], _past(u, n), _past(y, n))
-    e = e[:, e.std(axis=0) > 1e-7]  # rounding
+    e = e[:, e.std(axis=0) > 1e-7]  # smaller ones are rounding
     if not e.size:
         return none, 1.0
     e = e / e.std(axis=0)
@@ -68,7 +68,7 @@ def _explained(u: Array, y: Array, feedthrough: bool) -> tuple[Array, float]:
 
 
 def rubs(u: Array, y: Array) -> bool:
-    """Return whether a force (T,) that moves a position (T,) changes with its direction."""
+    """Return whether a force (T,) that moves a position (T,) changes with the direction."""
     # The signals are averaged over windows of several lengths, as differences enlarge noise.
     T = len(u)
     if len(np.unique(u)) <= _LEVELS or np.ptp(y) == 0:

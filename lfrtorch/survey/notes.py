@@ -22,20 +22,20 @@ from lfrtorch.survey.signal import SignalSurvey, held
 
 _SHORT = 300  # samples: a small NL-LFR model has 50 to 100 parameters
 _ENOUGH = 100  # samples of a record for notes on what it excites
-_MOST = 2**21  # samples of a record that are looked at, the first ones after ``skip``
+_MOST = 2**21  # samples of a record that are examined, the first ones after ``skip``
 
-# All stands still if for the share STILL of the record, which is looked at in STRETCHES parts, the
-# inputs stay within REST of their rms, the outputs' means over the parts within SETTLED of theirs,
-# and an output's rms within each part is at most QUIET of that in the record.
+# Nothing moves in a part with share STILL of the record, cut into STRETCHES pieces, if there the
+# inputs stay within REST of their rms, the outputs' means over the pieces within SETTLED of theirs,
+# and an output's rms within each piece is at most QUIET of its rms in the record.
 _STILL, _STRETCHES, _REST, _SETTLED, _QUIET = 0.2, 200, 0.05, 0.1, 0.2
 
-# A record is oversampled if 99 % of the power lies below fs / OVERSAMPLED; decimation leaves it
+# A record is oversampled if 99 % of the power lies below fs / OVERSAMPLED; after decimation it lies
 # below fs / WANTED.
 _OVERSAMPLED, _WANTED = 30, 10
-_COARSE, _FEW = 0.05, 200  # step of a coarse output over its rms; least samples of its record
+_COARSE, _FEW = 0.05, 200  # step of a coarse output over its rms; smallest record with a note on it
 
-# An input of fewer frequencies is narrow; a frequency counts if it has the share LINE of the power
-# of the strongest. LOBE lines of a windowed spectrum are of one sine.
+# An input with fewer than FEW_FREQUENCIES is narrow; a frequency counts from the share LINE of the
+# strongest one's power on. A sine takes LOBE lines of a windowed spectrum.
 _FEW_FREQUENCIES, _LINE, _LOBE = 5, 1e-4, 6
 _NARROW = 0.1  # an input is narrow, too, if its band is narrower than this times its centre
 _SAME = 0.999  # correlation of two inputs that carry the same signal
@@ -44,17 +44,17 @@ _SAME = 0.999  # correlation of two inputs that carry the same signal
 # the record within the factor ALIKE, and at most OTHERS of that of any input or its magnitude.
 _DRIFT, _ALIKE, _OTHERS = 0.2, 3.0, 0.05
 
-# The output comes first if the causality is below BEFORE and the reverse one above AFTER. A reverse
-# gain that rises with frequency speaks against it, as an integrator with feedthrough has it; then
-# the causality must be below CERTAIN.
+# The output precedes the input if the causality is below BEFORE and the reverse causality above
+# AFTER. A reverse gain that rises with frequency speaks against it, as an integrator with
+# feedthrough has one; then the causality must be below CERTAIN.
 _BEFORE, _AFTER, _CERTAIN = -0.15, 0.5, -0.4
-_PLANNED = 1e-3  # rms over the signal's of what an input without feedback does not repeat
+_PLANNED = 1e-3  # noise of an input without feedback, from period to period, over its rms
 _SHOWN = 6  # outliers that a note names; it counts the others
 
 # Coherence beyond chance above which the causality test means something, and below which the output
 # does not follow the inputs.
 _COHERENT, _UNRELATED = 0.1, 0.05
-_DELAY, _SHARP = 5, 0.5  # samples of a dead time worth a shift; its share of the peak's lag
+_DELAY, _SHARP = 5, 0.5  # samples of a dead time worth a shift; its least share of the peak's lag
 
 
 _SENTENCES = {
@@ -63,8 +63,8 @@ _SENTENCES = {
     "outputs are not fitted there; fill the gaps of inputs, or cut there by gaps='split'.",
     "mark": "{side}'{name}' is exactly {value:g} in {count} samples, at {places}, far from all "
     "other values: a mark for a missing value, or a dropout; {remedy}.",
-    "frozen": "{side}'{name}' stays exactly {places}, while the input moves, and changes at each "
-    "sample else around it: check the sensor; {remedy}.",
+    "frozen": "{side}'{name}' stays exactly {places}, while the input moves, but changes at every "
+    "sample around it: check the sensor; {remedy}.",
     "constant": "{side}'{name}' is constant at {one.mean:.6g}{told}",
     "still": "no input or output moves in {share:.0f} % of the record (samples {first} to "
     "{last}): little is learnt there; cut most of it off, or excite the system all the time.",
@@ -78,39 +78,39 @@ _SENTENCES = {
     "parameters; measure longer.",
     "outliers": "{side}'{name}' has {count} outlier(s), at sample {places}: if misread, {remedy}, "
     "by Record(valid=...) or an empty cell of the output.",
-    "binary": "input '{name}' has two values only: of a nonlinearity at the input nothing shows "
-    "between them; use a signal of many levels, as a multisine.",
+    "binary": "input '{name}' has two values only, between which a nonlinearity at the input does "
+    "not show; use a signal of many levels, such as a multisine.",
     "narrow": "input '{name}' excites {band} {unit} only: elsewhere a model is a guess; excite "
     "the band where it is used.",
     "lines": "input '{name}' excites {count} frequenc{ending} or so, {band} {unit}: enough for "
     "order {count}; excite the band where the model is used.",
     "oversampled": "99 % of all power lies below {highest:.3g} {unit}, fs / {ratio:.0f}: the "
     "record is oversampled.\nDecimate by {factor} (scipy.signal.decimate) for a faster fit, "
-    "unless modes above {lost:.3g} {unit}, which go with it, matter.",
+    "unless modes above {lost:.3g} {unit}, which are lost then, matter.",
     "held": "the inputs change every {hold} samples only, and 99 % of the outputs' power lies "
     "below {highest:.3g} {unit}:\none sample in {factor}, sample {first} among them, is enough "
     "for a faster fit, unless modes above {lost:.3g} {unit} matter.",
-    "periods": "the record has {count:.2f} periods of {period} samples{after}: less than two tell "
-    "no noise from distortion; measure more, or cut it to one in steady state.",
+    "periods": "the record has {count:.2f} periods of {period} samples{after}: two or more would "
+    "tell noise from distortion; measure more, or cut it to one in steady state.",
     "same": "inputs '{name[0]}' and '{name[1]}' carry the same signal (correlation "
     "{correlation:.4f}): what each does cannot be told; leave one out.",
     "swapped": "output '{output}' comes before input '{input}': are inputs and outputs swapped? "
     "(Or a controller makes the input from the output.)",
     "chain": "'{first}' integrates '{second}', which integrates, too: use start='measured', as "
-    "the outputs tell the states, and horizon=N, the samples ahead that count.",
+    "the outputs are the states, and horizon=N, the samples ahead that count.",
     "feedback": "input '{name}' reacts to the output: a controller closes the loop, and noise "
     "biases a fit; try {changes}, or give its reference=r{compare}.",
     "integrates": "output '{name}' integrates{behind}: use {known}start='estimated'; it has no "
     "steady state.",
     "friction": "input '{input}' changes with the direction of '{name}': dry friction or play; "
-    "take nx so large that a state can be the speed.",
-    "unrelated": "hardly anything of output '{name}' follows from the inputs linearly: other "
-    "columns, times that do not fit, noise, or a purely even nonlinearity.",
+    "raise nx until a state can be the speed.",
+    "unrelated": "hardly anything of output '{name}' follows from the inputs linearly: wrong "
+    "columns, times that do not match, noise, or a purely even nonlinearity.",
     "delay": "a dead time of about {delay} samples{lasting} from input '{input}' to output "
     "'{output}', after the usual one sample:\nshift the output by it, or a model spends as many "
     "states on it.",
     "drift": "output '{name}' drifts by {drift:.3g} in the record, {ratio:.1f} times its rms, and "
-    "no input does: take it off if the sensor drifts; leave it if the system integrates.",
+    "no input does: remove it if the sensor drifts; keep it if the system integrates.",
     "lost": "from about sample {sample} on, '{name}' follows the inputs one sample {turn}:\na "
     "sample of the {side} may be lost, or clocks differ; if so, cut the record there.",
     "gain": "from about sample {sample} on, the gain from the inputs to '{name}' is {ratio:.2g} "
@@ -131,14 +131,14 @@ _CONSTANT = {
 
 
 class Note(NamedTuple):
-    """A sentence, and its kind, which is the same in all records."""
+    """A sentence, and its kind, which is the same for all records."""
 
     kind: str
     text: str
 
     @classmethod
     def of(cls, row: str, name: Any = "", *, kind: str = "", **values: Any) -> Note:
-        """The sentence of a row on what has this name; ``kind`` if it is not both."""
+        """Fill in a row's sentence; the kind is the row and the name unless ``kind`` is given."""
         sentence = _SENTENCES[row].format(name=name, **values)
         return cls(kind or f"{row} {name}".rstrip(), sentence)
 
@@ -156,14 +156,14 @@ def examine(
 
     Args:
         found: its survey. Without inputs all signals count as outputs.
-        skipped: samples of the record before these, which count in the numbers of samples.
-        moving: the inputs that move elsewhere, in other records or in skipped samples.
-        given: arguments of :func:`lfrtorch.estimate_bla` that are set: what they do already is not
-            advised.
+        skipped: number of skipped samples before these, added to the sample numbers in notes.
+        moving: whether each input moves elsewhere, in other records or in skipped samples.
+        given: arguments of :func:`lfrtorch.estimate_bla` that are set: notes do not advise what
+            these do already.
     """
     notes = [*_missing(found)]
     faults, u, y = _faults(found, u, y, skipped)
-    if faults:  # all else is looked at without them
+    if faults:  # the other notes are on the signals without the faults
         inputs, outputs = ([one.channel for one in side] for side in (found.inputs, found.outputs))
         period = found.inputs[0].period if inputs else None
         found = survey_measurement(u, y, found.fs, inputs=inputs, outputs=outputs, period=period)
@@ -180,8 +180,8 @@ def notes_on(
 ) -> list[str]:
     """Say what will hurt a model of the records, and what to do about it, a sentence each.
 
-    If there are several records, a sentence names the record. Skipped samples are not looked
-    at; ``given`` is that of :func:`examine`.
+    If there are several records, a sentence names its record. Skipped samples are not examined;
+    ``given`` is as in :func:`examine`.
     """
     data = as_records(records)
     levels = np.concatenate([r.u for r in data])
@@ -198,7 +198,7 @@ def notes_on(
         seen = examine(found, r.u[scored], r.y[scored], skipped=r.skip, moving=moving, given=known)
         for kind, text in seen:
             if kind.startswith("integrates") and r.start == "estimated":
-                continue  # a fit says it, if its model does not integrate
+                continue  # a fit says this itself, if its model does not integrate
             settled = r.start == "measured" or np.any(known.get("integrators", 0))
             if kind.startswith(("chain", "rate")) and settled:
                 continue
@@ -227,7 +227,7 @@ def _sides(found: Survey) -> list[str]:
 
 
 def _faults(found: Survey, u: Array, y: Array, skipped: int) -> tuple[list[Note], Array, Array]:
-    """Notes on what sensors wrote that they did not measure, and the signals without it."""
+    """Return notes on values that sensors did not measure, and the signals without them."""
     notes = list[Note]()
     u, y = u.copy(), y.copy()
     nu = u.shape[1]
@@ -260,7 +260,7 @@ def _faults(found: Survey, u: Array, y: Array, skipped: int) -> tuple[list[Note]
 def _levels(
     found: Survey, u: Array, y: Array, skipped: int, moving: Sequence[bool]
 ) -> Iterator[Note]:
-    """Constant, clipped and coarse signals, a rest, a short record."""
+    """Notes on constant, clipped and coarse signals, a rest, and a short record."""
     T, sides = len(y), _sides(found)
     alone = not any(one.rms > 0 for one in found.inputs)
     steps = alone and any(output.rms > 0 for output in found.outputs)
@@ -367,7 +367,7 @@ def _relations(
         integrators(u, channel) or int(rate[i] is not None and grows(u, channel))
         for i, channel in enumerate(y.T)
     ]
-    # Two integrators are behind all outputs or none.
+    # Two integrators must be behind all outputs or none.
     some = counts if min(counts) else [min(count, 1) for count in counts]
     asked = counts[0] if len({*counts}) == 1 else f"[{','.join(map(str, some))}]"
     both = ((i, j) for i, j in enumerate(rate) if j is not None and counts[i] and counts[j])
@@ -414,7 +414,7 @@ def _relations(
 
 
 def _repeats(one: SignalSurvey) -> bool:
-    """Tell whether an input repeats so well that no noise is in it, as a controller would bring."""
+    """Tell whether an input repeats without noise, which a controller would bring in."""
     return one.method == "periods" and one.noise is not None and one.noise < _PLANNED * one.rms
 
 

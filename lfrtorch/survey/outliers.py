@@ -1,13 +1,14 @@
 """Outliers: one or two samples that stick out of a signal as nothing else in it does.
 
-The height of a sample is the part removed by opening and closing by three samples (white and
-black top-hat): nothing at a step, at a drift or in a smooth signal, the whole height of a lone
-sample. Outliers stick out farther than the tail of these heights promises, a Weibull tail
+The height of a sample is what opening and closing by three samples remove (white and black
+top-hat): nothing at a step, in a drift or in a smooth signal, and the whole height of a lone
+sample. Outliers are higher than the tail of these heights promises, a Weibull tail
 
     P(height > h) = exp(-(h / b)ᶜ),
 
-or are divided from all others by a gap; and they lie beyond the range of all other samples, or are
-higher than their jumps. So a pulse among pulses is none, nor is the peak of a random signal.
+or are separated from all others by a gap. They also lie beyond the range of all other samples, or
+are higher than the jumps between these. So neither a pulse among pulses nor the peak of a random
+signal is an outlier.
 
 References:
     Serra (1982), Image Analysis and Mathematical Morphology, Academic Press: the top-hat.
@@ -21,26 +22,26 @@ from scipy.ndimage import black_tophat, maximum_filter1d, white_tophat
 
 from lfrtorch._support.types import Array, Integers
 
-_SHORTEST, _LEVELS = 100, 16  # samples of a record that can tell; values of a signal of levels
-_MOST, _FEW = 0.02, 3  # share, or number in a short record, of outliers: more are by design
+_SHORTEST, _LEVELS = 100, 16  # samples of the shortest record; values of a signal of levels
+_MOST, _FEW = 0.02, 3  # largest share of outliers, or number in a short record: more are by design
 
-# Quantiles of the heights that fix the tail, the lighter one of those from BODY to TAIL, and how
-# likely the largest height of a record exceeds what it promises.
+# Quantiles of the heights that fix the tail: the lightest of the tails from one of BODY to TAIL;
+# and the probability that the largest height of a record exceeds what the tail promises.
 _TAIL, _BODY, _CHANCE = 0.97, (0.5, 0.8), 0.01
-_GAP = 3.0  # heights that are this many times the next lower one are no part of the tail
+_GAP = 3.0  # heights that are this many times the next lower one do not belong to the tail
 
 # Outliers are farther from all other samples than BEYOND of these samples' range, or higher than
-# ABOVE times their largest jump, and than STEPS steps of the converter.
+# ABOVE times the largest jump of these. They are also higher than STEPS steps of the converter.
 _BEYOND, _ABOVE, _STEPS = 0.2, 1.5, 5.0
-_END = 1.0  # the first and last two, which may be a rest or a transient, than this part of it
+_END = 1.0  # in place of BEYOND for the first and last two samples, maybe of a rest or transient
 
-# An input is active if it jumped in the last BEFORE samples by ACTIVE times what is usual. What
-# sticks out of an output then is its response, unless the inputs are active for more than RARELY of
-# the record and ALIKE of what would by chance sticks out while they are not.
+# An input is active if it jumped in the last BEFORE samples by ACTIVE times its usual change.
+# Samples of an output that stick out then are its response. They are outliers if the inputs are
+# active for more than RARELY of the record, and other samples stick out at least ALIKE as often.
 _BEFORE, _ACTIVE, _RARELY, _ALIKE = 20, 2.0, 0.1, 0.5
 
-# Lone samples with more than DESIGN of the power are an experiment with impulses, if the power of
-# each output is RESPONDS times as large in the next BEFORE samples.
+# Lone samples with more than DESIGN of the power are an experiment with impulses, if each output
+# has RESPONDS times as much power in the next BEFORE samples as elsewhere.
 _DESIGN, _RESPONDS = 0.5, 10.0
 
 
@@ -90,7 +91,7 @@ def _sticking_out(x: Array) -> Integers:
     found &= (outside > np.where(inner, _BEYOND, _END) * (high - low)) | (
         inner & (height > _ABOVE * jumps.max(initial=0.0))
     )
-    between = np.zeros(T, bool)  # a good sample between two bad ones sticks out on their other side
+    between = np.zeros(T, bool)  # a good sample between two outliers sticks out on the other side
     between[1:-1] = found[:-2] & found[2:] & (outside[1:-1] <= 0)
     return np.flatnonzero(found & ~between)
 
@@ -113,7 +114,7 @@ def _limit(height: Array) -> float:
 
 
 def _filled(x: Array) -> Array:
-    """A signal with straight lines where samples are missing, which stick out of nothing."""
+    """A signal with straight lines for missing samples, which therefore do not stick out."""
     known = np.isfinite(x)
     if known.all() or not known.any():
         return np.nan_to_num(x)

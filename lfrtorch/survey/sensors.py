@@ -1,8 +1,9 @@
-"""Sensor faults: marks that stand for a missing value, and values at which a sensor froze.
+"""Sensor faults: values that mark a missing sample, and values at which a sensor froze.
 
-A mark, as -9999 or 999.9, is one value that comes several times and lies far from all others. A
-frozen sensor repeats one value exactly while the inputs move, and changes at each sample before and
-after. A slow signal in coarse steps does not: near its turning points several values are repeated.
+A mark, such as -9999 or 999.9, is one value that occurs several times and lies far from all others.
+A frozen sensor repeats one value exactly while the inputs move, and changes at each sample before
+and after. A slow signal in coarse steps is not frozen: near its turning points several values are
+repeated.
 """
 
 from __future__ import annotations
@@ -14,23 +15,23 @@ import numpy as np
 from lfrtorch._support.types import Array, Booleans
 from lfrtorch.survey.signal import moves, runs
 
-_LEVELS = 16  # a signal of so few values consists of levels
+_LEVELS = 16  # a signal of at most so many values consists of levels
 
-# A mark comes MARKS times or more, in at most SOME of the record, and its distance to the nearest
-# other value is FAR times the range of these. Of an input, which may be a pulse, only CODES count.
+# A mark occurs MARKS times or more, in at most SOME of the record, and its distance to the nearest
+# other value is FAR times the range of the others. An input may be a pulse: there only CODES count.
 _MARKS, _SOME, _FAR = 3, 0.1, 3.0
 _NINES = re.compile(r"9[.9]*9")
 _CODES = (32767, 32768, 65535, 2147483647, 2147483648)
 
-# A value is frozen if it is repeated FROZEN times or more, LONGER times as often as any in as many
-# samples before and after, AROUND at least, of which at most REPEATED are the same as the one
-# before. More than FEW places half as long are by design: play, a dead zone, dry friction.
+# A value is frozen if it is repeated FROZEN times or more, and LONGER times as often as any value
+# in as many samples (at least AROUND) before and after. At most REPEATED of these samples equal the
+# one before. More than FEW places half as long are by design: play, a dead zone, dry friction.
 _FROZEN, _LONGER, _AROUND, _REPEATED, _FEW = 10, 8, 30, 0.1, 3
-_JUMP = 0.05  # change to or from it, over the usual one: a motion that stops and starts has less
+_JUMP = 0.05  # smallest jump to or from it, over the usual change; a motion that stops has less
 
 
 def marked(x: Array, *, of_input: bool = False) -> Booleans:
-    """Return the samples (T,) of a signal that have a mark for a value."""
+    """Return the samples (T,) of a signal whose value is a mark."""
     values, counts = np.unique(x[np.isfinite(x)], return_counts=True)
     found = np.zeros(len(x), bool)
     if len(values) <= _LEVELS:

@@ -12,24 +12,24 @@ from lfrtorch.data.periods import find_transient
 from lfrtorch.data.records import Channel
 
 LEAST = 16
-"""Least samples of a spectrum."""
+"""Smallest number of samples of a spectrum."""
 
 _IN_BAND = 0.99  # share of the power about the mean in the band; half of the rest is below it
-_QUIET = 0.2  # quantile of the spectrum that is the level of white noise
-_LOUD = 0.5  # largest rms of noise over the signal's that a spectrum can tell from the signal
-_SEGMENTS, _LONGEST = 8, 4096  # least segments of an averaged spectrum, and most samples of one
+_QUIET = 0.2  # quantile of the spectrum that is taken for the level of white noise
+_LOUD = 0.5  # largest rms of noise, over the signal's, that a spectrum can separate from the signal
+_SEGMENTS, _LONGEST = 8, 4096  # least number of segments of a spectrum; their largest length
 
-# A signal is clipped if it is at an extreme for SAMPLES, RUN of them in a row, and RATIO times as
-# often as at any of the next NEIGHBOURS values. (A sine in coarse steps has a ratio of 2.4.)
+# A signal is clipped if SAMPLES samples are at an extreme, RUN of them in a row, and RATIO times as
+# many as at any of the next NEIGHBOURS values. (A sine in coarse steps has a ratio of 2.4.)
 _CLIPPED_SAMPLES, _CLIPPED_RUN, _CLIPPED_RATIO, _NEIGHBOURS = 5, 3, 5, 5
 
-# It is not clipped but rests where the record begins, and where no input moves as it comes there,
-# by a last change of SMOOTH of its rms or of two steps of the converter at most.
+# It rests at the extreme, and is not clipped, where the record begins. It also rests if no input
+# moves when it arrives there, by a last change of at most SMOOTH of its rms or two converter steps.
 _SMOOTH = 0.01
 _LEVELS = 16  # a signal of so few values consists of levels, like a binary one; it is not clipped
 _REST = 0.05  # a signal that stays within this part of its rms does not move
-# A slow clock holds a signal for more than LEAST_HOLD samples, always as many, and changes it at
-# TICKS or more, at the share EACH of them at least: a binary signal changes at half of them.
+# A slow clock holds a signal for more than LEAST_HOLD samples, always for as many. The signal then
+# changes at TICKS or more, and at least at the share EACH of them: a binary signal changes at half.
 _TICKS, _LEAST_HOLD, _EACH = 20, 2, 0.8
 _SILENT = 1e-10  # power of a combination of inputs, relative to the largest, that counts as none
 
@@ -44,7 +44,7 @@ class Extreme(NamedTuple):
 
 
 class SignalSurvey(NamedTuple):
-    """Statistics of a signal of T samples; numbers are NaN if it has no values.
+    """Statistics of a signal of T samples; numbers are NaN if the signal has no values.
 
     Args:
         channel: its name and unit.
@@ -58,10 +58,10 @@ class SignalSurvey(NamedTuple):
         band: frequencies in Hz between which 99 % of the power about the mean lies.
         period: samples of a period, ``None`` if it does not repeat.
         noise: its estimated rms, ``None`` if it cannot be told from the signal.
-        method: estimate of the noise. ``"periods"``: the scatter of whole periods in steady state;
-            ``"spectrum"``: a guess, the level of the quietest part of the spectrum as if of white
-            noise. An output has the part that does not follow the inputs; other signals too much
-            if signal is everywhere. Too little if a filter took noise away.
+        method: estimate of the noise. ``"periods"``: the scatter of whole periods in steady state.
+            ``"spectrum"``: a guess, the quietest part of the spectrum taken for white noise. For an
+            output this is the part that does not follow the inputs. It is too large for other
+            signals if they fill all of the band, and too small if a filter removed noise.
     """
 
     channel: Channel
@@ -81,7 +81,7 @@ class SignalSurvey(NamedTuple):
 
     @property
     def clipped(self) -> tuple[Extreme, ...]:
-        """The extremes that it is clipped at."""
+        """The extremes at which the signal is clipped."""
         return tuple(end for end in (self.minimum, self.maximum) if end.clipped)
 
 
@@ -95,8 +95,8 @@ def survey_signal(
     inputs: Array | None = None,
 ) -> SignalSurvey:
     """Return the numbers of a signal (T,), NaN where a sample is missing."""
-    # ``whole`` is its longest part without gaps, for the spectrum, and ``inputs`` (T, nu) what it
-    # follows, if it is an output.
+    # ``whole`` is its longest part without gaps, for the spectrum. ``inputs`` (T, nu) are the
+    # signals that it follows, if it is an output.
     missing = ~np.isfinite(signal)
     known = signal[~missing] if missing.any() else signal
     values, counts = np.unique(known, return_counts=True)
@@ -145,7 +145,7 @@ def moves(u: Array, parts: Integers) -> list[bool]:
 
 
 def held(u: Array) -> tuple[int, int] | None:
-    """Samples for which a slow clock holds signals u (T, nu), and its first one; else None."""
+    """Return for how many samples a slow clock holds u (T, nu), and its first change; else None."""
     at = np.flatnonzero((np.diff(u, axis=0) != 0).any(axis=1)) + 1
     if len(at) < _TICKS:
         return None
@@ -189,7 +189,7 @@ def _extreme(signal: Array, values: Array, counts: Integers, inputs: Array | Non
 def _noise(
     signal: Array, period: int | None, inputs: Array | None = None
 ) -> tuple[float | None, str]:
-    """The rms of the noise in a signal, and the method that estimates it."""
+    """The rms of the noise in a signal, and the method by which it is estimated."""
     if period is not None:
         count = (len(signal) - find_transient(signal[:, None], period)) // period
         if count > 1:

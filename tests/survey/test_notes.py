@@ -449,7 +449,7 @@ def test_a_chain_of_outputs_tells_the_states(u):
     wild = np.random.default_rng(2).standard_normal(T)  # as if a controller made the input
     held = np.column_stack([np.cumsum(np.cumsum(turned)), np.cumsum(turned), turned, slope])
     assert "chain" in found(wild, held)
-    assert "use start='measured', as the outputs tell the states, and horizon=N" in said["chain"]
+    assert "use start='measured', as the outputs are the states, and horizon=N" in said["chain"]
 
 
 def test_what_is_settled_needs_no_advice_on_integrators(u):
