@@ -17,7 +17,7 @@ from lfrtorch.model.extended_kalman_filter import NoiseCovariance
 from lfrtorch.model.model import Model
 
 _LINE = 96
-"""Most characters of a line of numbers."""
+"""Largest number of characters in a line of numbers."""
 
 
 def c_source(
@@ -27,13 +27,13 @@ def c_source(
     observer: bool | NoiseCovariance = False,
     single: bool = False,
 ) -> tuple[str, str]:
-    """A model as C99: one step, its Jacobians, and the states to start from.
+    """Write a model as C99: one step, its Jacobians, and the states to start from.
 
     ``NAME_step`` is one sample in physical units, ``NAME_jacobians`` the matrices of the model
     linearised at a state and an input. ``NAME_reset`` writes the state 0, and ``NAME_rest`` the
-    state at rest with the inputs at their operating point, if there is one. ``NAME_reach`` is the
-    square of the surprise index, at most 1 for 99 % of the data of the fit, if the model knows its
-    reach. Sizes and the sampling time are macros, as ``NAME_NX`` and ``NAME_TS``. The code
+    state at rest with the inputs at their operating point, if there is one. If the model knows its
+    reach, ``NAME_reach`` is the square of the surprise index, at most 1 for 99 % of the data of the
+    fit. Sizes and the sampling time are macros, as ``NAME_NX`` and ``NAME_TS``. The code
     allocates nothing and keeps no state of its own.
 
     An observer adds ``NAME_observer_reset``, ``NAME_observer_predict`` and
@@ -52,7 +52,7 @@ def c_source(
         The texts of ``NAME.h`` and ``NAME.c``.
 
     Raises:
-        ValueError: a static map without equations, a name that is no identifier, or an
+        ValueError: a static map without equations, a name that is not an identifier, or an
             observer that the model does not have.
 
     Example:
@@ -89,7 +89,7 @@ def _slopes(f: Formula) -> Formula:
 
 def _single(text: str) -> str:
     """Convert C of double precision to single precision; comments stay."""
-    # tgmath.h has exp, sqrt, .. of the type of their argument.
+    # The functions of tgmath.h (exp, sqrt, ..) have the type of their argument.
     text = text.replace("#include <math.h>", "#include <tgmath.h>")
     parts = re.split(r"(/\*.*?\*/)", text, flags=re.DOTALL)
     for i in range(0, len(parts), 2):
@@ -111,7 +111,7 @@ def _pairs(rows: Array) -> str:
 
 
 def _braces(rows: Sequence[Sequence[str]]) -> str:
-    """Numbers in braces, a line or more for each row; they are read back to the same bits."""
+    """Numbers in braces, a line or more for each row; reading them back gives the same bits."""
     lines = []
     for row in rows:
         line = "   "

@@ -20,10 +20,10 @@ from lfrtorch.model.model import Model
 
 
 def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
-    """Sample of a model as a ``casadi.Function`` (x, u) -> (x_next, y), physical units.
+    """Export one sample of a model as a ``casadi.Function`` (x, u) -> (x_next, y), physical units.
 
-    It is a graph of scalars (SX) without calls of Python, so that CasADi has derivatives of any
-    order, can print it as C, and solvers may run it in threads. CasADi expands a number that is
+    It is a graph of scalars (SX) without calls of Python. So CasADi has its derivatives of any
+    order and can print it as C, and solvers may run it in threads. CasADi expands a number that is
     given in place of a vector, and refuses other sizes.
 
     Args:
@@ -35,7 +35,7 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
 
     Raises:
         ValueError: casadi is not installed, a static map without equations, or a name that is
-            no identifier.
+            not an identifier.
 
     Example:
         >>> f = lfrtorch.export.casadi_function(model, "actuator")
@@ -57,14 +57,14 @@ def casadi_reach(model: Model, name: str = "model") -> Any:
     """Distance of an operating point from the data of the fit, as a ``casadi.Function``.
 
     ``NAME_reach`` is (x, u) -> (reach), the square of the surprise index: 99 % of the data are
-    within 1, and beyond the model extrapolates. So ``reach <= 1`` is a smooth constraint.
+    within 1; beyond 1 the model extrapolates. So ``reach <= 1`` is a smooth constraint.
 
     Args:
         model: result of ``lfrtorch.identify`` or ``Model.reaching``.
         name: first part of the function's name.
 
     Raises:
-        ValueError: a linear model, one whose reach is not known, or as ``casadi_function``.
+        ValueError: a linear model, a model without known reach, or as for ``casadi_function``.
 
     Example:
         >>> reach = lfrtorch.export.casadi_reach(model.reaching(record), "plant")
@@ -95,8 +95,8 @@ def casadi_observer(
     from which a controller chooses u; ``update`` then takes the earlier x and P. A constant gain K
     leaves the state unchanged. The u of ``correct`` does not matter without feedthrough.
 
-    An output is ignored if its ``missing`` is 1; by default none is. A P that is omitted, or NaN,
-    is the covariance of the states over the training data, with which a filter begins. The
+    An output is ignored if its ``missing`` is 1; by default all are used. If P is omitted or NaN,
+    it is the covariance of the states over the training data, with which a filter begins. The
     covariance is updated in Joseph's form.
 
     Args:
@@ -109,7 +109,7 @@ def casadi_observer(
         x: (nx,), P: (nx, nx), u: (nu,), y, missing: (ny,).
 
     Raises:
-        ValueError: as ``casadi_function``, and for an observer that the model does not have.
+        ValueError: as for ``casadi_function``, or an observer that the model does not have.
 
     Example:
         >>> noise = lfrtorch.NoiseCovariance(Q=1e-4, R=1e-2)
@@ -147,7 +147,7 @@ def casadi_observer(
     given.append(ca.SX.sym("P", nx, nx))
     Q, S, R, P0 = found.values()
     P = ca.if_else(given[-1] < np.inf, given[-1], P0)
-    # A missing output has a row of zeros in H, and noise of its own alone.
+    # A missing output has a row of zeros in H, and no noise but its own.
     known = ca.diag(1.0 - missing)
     H, R, S = (
         ca.mtimes(known, ca.jacobian(y_hat, x)),

@@ -24,10 +24,10 @@ _NUMPY = {
 
 
 def control_system(model: Model | LinearModel, name: str = "model") -> Any:
-    """System of a model as a ``control.NonlinearIOSystem`` in discrete time, physical units.
+    """Export a model as a ``control.NonlinearIOSystem`` in discrete time, physical units.
 
-    Dots in channel names, which that package does not allow, become underscores. The second of two
-    names that are then equal gets one more.
+    Dots in channel names, which that package does not allow, become underscores. If two names
+    become the same, the second one gets another underscore.
 
     Args:
         model: the model to export.
@@ -35,7 +35,7 @@ def control_system(model: Model | LinearModel, name: str = "model") -> Any:
 
     Raises:
         ValueError: control is not installed, a static map without equations, or a name that
-            is no identifier.
+            is not an identifier.
 
     Example:
         >>> import control
@@ -61,7 +61,7 @@ def python_source(model: Model | LinearModel, name: str = "model") -> str:
         name: name of the system.
 
     Raises:
-        ValueError: a static map without equations, or a name that is no identifier.
+        ValueError: a static map without equations, or a name that is not an identifier.
 
     Example:
         >>> made = {}

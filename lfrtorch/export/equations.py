@@ -30,7 +30,7 @@ from lfrtorch.model.model import NO_OBSERVER, Model
 
 
 class Signals(Vectors, Protocol):
-    """A language of vectors that knows all arrays of a model."""
+    """An export language for expressions of vectors that knows all arrays of a model."""
 
     def deviation(self, u: Any) -> Any:
         """u - u_offset."""
@@ -53,11 +53,11 @@ class Equations:
 
     Args:
         name: name of the model in an export.
-        matrices: A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw; nz = nw = 0 of a linear model.
+        matrices: A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw; a linear model has nz = nw = 0.
         u_offset, y_offset: operating point.
-        x_rest: state at rest under u_offset, (nx,); empty if none was found. x = 0 is near it.
+        x_rest: state at rest under u_offset, (nx,), near x = 0; empty if none was found.
         map: f; nz = nw = 0 for a linear model.
-        written: f in the form for exports.
+        written: f in the form that exports write.
         weights: the arrays of ``written``.
         fs: sampling frequency in Hz.
         inputs, outputs: channel names and units.
@@ -97,8 +97,8 @@ class Equations:
 
     def about(self, place: str = "{0}[{1}]") -> list[str]:
         """Description for readers of the export: equations, channels, units, offsets, rate."""
-        # ``place`` is how its language writes a channel: letter {0}, number from 0 {1} and from 1
-        # {2}.
+        # ``place`` is a channel as the language writes it: {0} is its letter, {1} its number from 0
+        # and {2} its number from 1.
         known = {"place": place, "version": version("lfrtorch"), "printable": printable}
         return self.rendered("about.txt", **known).splitlines()
 
@@ -128,7 +128,7 @@ class Equations:
         return T, T @ self.reach.z.middle
 
     def sample(self, language: Signals, x: Any, u: Any) -> tuple[Any, Any]:
-        """x+ and y of x and u in a language of expressions."""
+        """x+ and y for x and u, in a language of expressions."""
         v = language.deviation(u)
         x_next, y = {"A": x, "Bu": v}, {"Cy": x, "Dyu": v}
         if self.map.nw:
@@ -139,9 +139,9 @@ class Equations:
     def rendered(
         self, template: str, operations: Mapping[str, str] | None = None, **more: Any
     ) -> str:
-        """A text of the folder ``templates`` with all of this and ``more``.
+        """Render a template of the folder ``templates`` with these equations and ``more``.
 
-        Formulas have statements in the text's language, if it has ``operations``.
+        If ``operations`` of the text's language are given, formulas become statements in it.
         """
         import jinja2
 
@@ -168,7 +168,7 @@ def equations(
     name: str = "model",
     own: Callable[[Module, int], Written | None] = lambda *_: None,
 ) -> Equations:
-    """The equations of a model; ``own`` writes a static map of nz inputs that has none itself."""
+    """The equations of a model; ``own`` writes a static map of nz inputs without own equations."""
     check_name(name)
     model = model.to_model()
     cell, s = double(model.lfr.cell), model.scaler
@@ -214,10 +214,10 @@ def numbers(weight: Tensor) -> Array:
 
 
 class Observer(NamedTuple):
-    """The numbers of an observer by name, with covariances as roots of them or as they are.
+    """The numbers of an observer by name: with roots of covariances, or with the covariances.
 
-    K (nx, ny) of x+ = f(x, u) + K (y - y_hat) is in both. A filter has G with G Gᵀ = [R Sᵀ; S Q]
-    and U0 with U0 U0ᵀ = P0, of the states in the data; or Q, S, R and P0. No observer has nothing.
+    Both have K (nx, ny) of x+ = f(x, u) + K (y - y_hat). A filter has G with G Gᵀ = [R Sᵀ; S Q]
+    and U0 with U0 U0ᵀ = P0 of the states in the data; or Q, S, R and P0. No observer, no numbers.
     """
 
     roots: dict[str, Array]
@@ -249,7 +249,7 @@ _RESERVED = {
 
 
 def check_name(name: str) -> None:
-    """Refuse a name that is no identifier in each of the languages."""
+    """Refuse a name that is not an identifier in each of the languages."""
     word = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) and "__" not in name
     if not word or keyword.iskeyword(name) or name in _RESERVED:
         raise InputError(

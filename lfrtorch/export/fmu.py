@@ -1,4 +1,4 @@
-"""Export to a functional mock-up unit for co-simulation, FMI 2.0 or 3.0, compiled from its C."""
+"""Export to a functional mock-up unit for co-simulation, FMI 2.0 or 3.0, compiled from C code."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def write_fmu(
 
     Inputs, outputs and states are real variables with the channels' names and units; the states can
     be set before the simulation starts. The model samples its inputs every 1 / fs seconds and holds
-    its outputs in between: a communication step may have any size. At a sample an output
-    follows from the state and from the inputs at the time of reading. The whole state can be
-    saved, restored and serialized. Outputs have directional derivatives by inputs and states, and
+    its outputs in between, so that a communication step may have any size. An output at a sample
+    follows from the state and from the inputs at the time when it is read. The whole state can be
+    saved, restored and serialized. Outputs have directional derivatives with inputs and states, and
     the description lists the inputs of each output.
 
     Args:
@@ -40,8 +40,8 @@ def write_fmu(
         version: version of FMI, 2 or 3.
 
     Raises:
-        ValueError: no C compiler, another machine than Linux on x86_64, a static map
-            without equations, or a name that is no identifier.
+        ValueError: no C compiler, a machine other than Linux on x86_64, a static map without
+            equations, or a name that is not an identifier.
 
     Example:
         >>> lfrtorch.export.write_fmu(model, "actuator.fmu", "actuator")
@@ -50,7 +50,7 @@ def write_fmu(
 
 
 def fmu(model: Model | LinearModel, name: str, version: int) -> bytes:
-    """The archive that an FMU is."""
+    """The bytes of the FMU, a zip archive."""
     header, source = c_source(model, name)
     e = equations(model, name)
     known: dict[str, Any] = {"version": version, "u_start": e.u_offset.tolist()}
@@ -58,7 +58,7 @@ def fmu(model: Model | LinearModel, name: str, version: int) -> bytes:
     known |= {"title": " ".join(e.about()[:2]), "ts": repr(1.0 / e.fs)}
     known["variables"] = _variables(e) if version == 3 else _variables(e)[:-1]  # FMI 3 has the time
     known["units"] = list(dict.fromkeys(unit for _, unit, *_ in known["variables"] if unit))
-    # Which inputs each output depends on, and at the beginning which states.
+    # The inputs that each output depends on, and at the beginning also the states.
     M, nu, ny, first = e.matrices, len(e.inputs), len(e.outputs), int(version == 2)
     by_w = (M.Dyw != 0).any(axis=1)[:, None] & (M.Dzu != 0).any(axis=0)
     by_u = (M.Dyu != 0) | by_w
@@ -91,7 +91,7 @@ def _compiled(files: dict[str, str], name: str) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         for file, text in files.items():
             (Path(folder) / file).write_text(text, encoding="utf-8")
-        # Functions of the same name in other libraries do not replace these.
+        # -Bsymbolic: functions of the same name in other libraries do not replace these.
         options = ["-std=c99", "-O2", "-fPIC", "-shared", "-Wl,-Bsymbolic"]
         sources = [file for file in files if file.endswith(".c")]
         command = [compiler, *options, "-o", "made.so", *sources, "-lm"]

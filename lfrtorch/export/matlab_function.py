@@ -21,12 +21,15 @@ def matlab_function(
     """Functions of a model for MATLAB and Octave.
 
     ``[x_next, y, A, B, C, D] = NAME(x, u)`` is one sample in physical units; A, B, C and D are the
-    matrices of the model linearised there. Its numbers are in ``NAME_numbers.m``, so that it may
-    stand in a MATLAB Function block and code can be generated. ``[A, B, C, D, p] = NAME_lpv(x, u)``
-    has the matrices of the exact LPV form, ``lfrtorch.analysis.lpv(model)``. The variables of
-    ``NAME.mat``, for ``scipy.io.savemat``, are all matrices of the model, offsets, names and units
-    of the channels, fs, and the state ``x_rest`` at rest under the inputs' offsets (empty if there
-    is none). ``lpv`` has the matrices of the LPV form (the third index counts them) and its bounds.
+    matrices of the model linearised at x and u. The model's numbers are in ``NAME_numbers.m``. So a
+    MATLAB Function block can call NAME, and code can be generated from it.
+    ``[A, B, C, D, p] = NAME_lpv(x, u)`` gives the matrices of the exact LPV form,
+    ``lfrtorch.analysis.lpv(model)``.
+
+    The variables of ``NAME.mat``, for ``scipy.io.savemat``, are the matrices of the model, offsets,
+    names and units of the channels, and fs. ``x_rest`` is the state at rest under the inputs'
+    offsets, empty if there is none. ``lpv`` holds the matrices of the LPV form, counted by their
+    third index, and the bounds of p.
 
     An observer adds ``s = NAME_start()``, ``s = NAME_correct(s, u, y)`` and
     ``s = NAME_advance(s, u)``: s.x is its state, and s.P the covariance of its error.
@@ -41,7 +44,7 @@ def matlab_function(
         The texts of the functions by the names of their files, and the variables of ``NAME.mat``.
 
     Raises:
-        ValueError: a static map that is no network and no polynomial, a name that is no
+        ValueError: a static map other than a network or a polynomial, a name that is not an
             identifier, or an observer that the model does not have.
 
     Example:
@@ -57,8 +60,8 @@ def matlab_function(
     e = equations(model, name)
     if e.map.nw and not e.weights:
         raise InputError(
-            "this static map has no MATLAB code, which is made of arrays; export it to c, casadi, "
-            "control, fmu or onnx."
+            "MATLAB export needs a network or a polynomial, whose weights are arrays; export this "
+            "static map to c, casadi, control, fmu or onnx."
         )
     form = lpv(model)
     literals = {n: w if w.ndim == 2 else w[:, None] for n, w in e.arrays.items()}
@@ -86,7 +89,7 @@ def matlab_function(
 
 
 def _literal(M: Array) -> str:
-    """Literal of a matrix, which is read back to the same bits."""
+    """Write a matrix as a literal; reading it back gives the same bits."""
     if not M.size:
         return f"zeros({len(M)}, {M.shape[1]})"
     rows = ("    " + " ".join(repr(float(v)) for v in row) for row in M)

@@ -23,7 +23,7 @@ from lfrtorch.model.model import Model
 
 
 def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, Any]:
-    """Graphs of a model for ONNX, two in float64 and physical units.
+    """Export a model as two graphs of ONNX, in float64 and physical units.
 
     The first is one sample, (x, u) -> (x_next, y). The second is a simulation, (x0, u) ->
     (x_end, y), by the operator Scan over the samples. Both take several states and inputs at once,
@@ -45,7 +45,7 @@ def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, A
 
     Raises:
         ValueError: onnx is not installed, a static map without equations that cannot be traced, or
-            a name that is no identifier.
+            a name that is not an identifier.
 
     Example:
         >>> sample, simulation = lfrtorch.export.onnx_models(model, "actuator")
@@ -133,7 +133,7 @@ class Graph:
         """Apply a table of operations to the entries of v."""
         entries = self.split("Split", v, to=[f"z{j}" for j in range(formula.inputs)], axis=-1)
         nothing = self.node("Mul", entries[0], self.number(0.0))
-        varying: set[int] = set()  # rows that are no constants, which are shorter
+        varying: set[int] = set()  # rows that depend on v; constant rows are shorter
         for place, row in enumerate(formula.rows):
             if row.name == "input" or varying.intersection(row.operands):
                 varying.add(place)

@@ -31,10 +31,10 @@ class Target(NamedTuple):
     """Target of an export.
 
     Args:
-        files: model and name -> text or bytes of each file by its name, in their order.
-        use: a line of a program that uses them, with {name} and the {path} of the first file.
-        follow: the same line with an observer, {path} being the last file; empty if there is no
-            observer. ``files`` takes one then.
+        files: function of model and name: text or bytes of each file by its name, in their order.
+        use: a line of a program that uses the files, with {name} and the {path} of the first file.
+        follow: such a line for the observer, with the {path} of the last file; empty if the target
+            has no observer. ``files`` takes the observer as an argument, too.
     """
 
     files: Callable[..., Mapping[str, str | bytes]]
@@ -42,7 +42,7 @@ class Target(NamedTuple):
     follow: str = ""
 
     def usage(self, name: str, paths: list[Path], observer: bool | NoiseCovariance) -> str:
-        """Line of a program that uses the files, the observer's if there is one."""
+        """Return the line of a program that uses the files, or their observer if there is one."""
         if observer is False:
             return self.use.format(name=name, path=paths[0])
         P = ", P=P" if isinstance(observer, NoiseCovariance) else ""
@@ -150,22 +150,22 @@ def write(
             ``NAME.m``, ``NAME_numbers.m`` and ``NAME_lpv.m`` with ``NAME.mat``; ``"control"``:
             ``NAME.py``, whose ``system()`` is a ``control.NonlinearIOSystem``; ``"fmu"`` and
             ``"fmu3"``: ``NAME.fmu``, FMI 2.0 or 3.0.
-        folder: folder of the files; it is made if need be.
-        name: name of the files, and in them.
+        folder: folder of the files; it is created if needed.
+        name: name of the files and of the model in them.
         overwrite: replace files that exist.
         observer: for C, CasADi and MATLAB, ``True`` adds the observer with the model's gain K,
             noise covariances an extended Kalman filter.
-        disturbance: place of constant disturbances, which become the last states and are
-            estimated by the filter, see ``Model.with_disturbance``.
+        disturbance: where constant disturbances act; they become the last states, which the
+            filter estimates, see ``Model.with_disturbance``.
 
     Returns:
         The files.
 
     Raises:
-        ValueError: an unknown target, one whose package is not installed, a name that is no
-            identifier, a file that exists, the folder of a checkpoint, a static map
-            without equations, an observer that the target or the model does not have, or a
-                disturbance without noise for the filter.
+        ValueError: an unknown target, a target whose package is not installed, a name that is not
+            an identifier, a file that exists, the folder of a checkpoint, a static map without
+            equations, an observer that the target or the model does not have, or a disturbance
+            without noise for the filter.
 
     Example:
         >>> [path.name for path in lfrtorch.export.write(model, "c", "made", name="actuator")]

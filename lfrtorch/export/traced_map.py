@@ -16,23 +16,23 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.optional import imported
 
 OPSET = 17
-"""Version of the operators, of 2022, which every runtime since then reads."""
+"""Version of the ONNX operators, of 2022, which every runtime since then can read."""
 
 IR = 8
 """Version of the file format that belongs to these operators."""
 
 _SAMPLES = (1, 5, 64)
-"""Batch sizes for which graph and map are compared."""
+"""Batch sizes for which the graph is compared with the map."""
 
 
 def traced(static: Module, nz: int) -> Any:
-    """Graph z (n, nz) -> w (n, nw) of a map; refuse a map that it does not reproduce."""
+    """Graph z (n, nz) -> w (n, nw) of a map; refuse a map whose values the graph does not give."""
     onnx = imported("onnx", "onnx")
     generator = torch.Generator().manual_seed(0)
-    file: Any = io.BytesIO()  # it accepts this, although its type hints do not
+    file: Any = io.BytesIO()  # torch.onnx.export accepts this, although its type hints do not
     static = deepcopy(static).eval()
     z = torch.randn(max(_SAMPLES), nz, generator=generator, dtype=torch.float64)
-    # Since torch 2.9 another exporter is the default, which needs one more package.
+    # Since torch 2.9 the default is another exporter, which needs one more package.
     older: dict[str, Any]
     older = {"dynamo": False} if "dynamo" in inspect.signature(torch.onnx.export).parameters else {}
     try:

@@ -8,7 +8,7 @@ from torch import Tensor
 from lfrtorch.model.known import Known, Parameter, State
 
 _EMPTY = 1e-3
-"""Least level at which the outflow has a slope, V: the slope of a root is infinite at 0."""
+"""Lowest level at which the outflow has a slope, V: the slope of a root is infinite at 0."""
 
 _SPILLS = 1.0
 """Rate of the overflow per level above the edge, 1/s: fast compared with samples of 4 s."""
@@ -17,9 +17,9 @@ _SPILLS = 1.0
 def cascaded_tanks() -> Known:
     """Cascaded tanks, the upper one filled by a pump; levels in V.
 
-    Both drain by a power of their level: 1/2 after Bernoulli, changed by hoses and by the offset of
-    the sensor. The overflow of the upper tank goes partly into the lower one, whose level ends at
-    its own edge. The pump delivers nothing below some voltage.
+    Both drain by a power of their level: 1/2 after Bernoulli, changed by hoses and by the sensor's
+    offset. Part of the upper tank's overflow goes into the lower tank, which overflows at its own
+    edge. The pump delivers nothing below some voltage.
 
     References:
         Schoukens, Mattson, Wigren and Noël, "Cascaded tanks benchmark combining soft and hard
@@ -65,8 +65,8 @@ _STICKS = 5e-4
 def emps() -> Known:
     """Drive of a linear axis: a force moves a mass against viscous and dry friction.
 
-    Parameters are per unit of mass, since the position does not determine the mass. The friction
-    differs between the two directions, as the offset and the slope with the speed describe.
+    Parameters are per unit of mass, since the position does not determine the mass. An offset and
+    a slope with the speed describe that friction differs between the two directions.
 
     References:
         Janot, Gautier and Brunot, "Data set and reference models of EMPS", Workshop on Nonlinear
@@ -110,8 +110,8 @@ def nanodrone() -> Known:
 
     The thrust along the body's vertical axis and the torques are sums of squares of the motor
     speeds. Air damps speeds and rates, and its flow across the propellers turns the body. The
-    measured velocity comes from an estimator, so the position changes by a multiple of it. One step
-    over a sample uses the rates, and with them the attitude, at the middle of the sample.
+    measured velocity comes from an estimator, so the position changes by a multiple of it. A step
+    over one sample uses the rates, and with them the attitude, at the middle of the sample.
 
     References:
         Mahony, Kumar and Corke, "Multirotor aerial vehicles: modeling, estimation, and control of

@@ -1,4 +1,4 @@
-"""A model on the inputs of a file: its start, its outputs in another file, and their scores."""
+"""Simulation of a model on the inputs of a file: start, outputs in another file, scores."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from lfrtorch.files.writer import table_writer
 from lfrtorch.model.model import Model, simulate_blocks
 
 BEGINNING = 100
-"""Samples in which the transient of a wrong start state would be seen."""
+"""Samples in which the transient of a wrong start state is looked for."""
 
-_TRANSIENT = 3.0  # error there over that of the rest above which there is a transient
-_LOOKED_AT = 1_000_000  # most samples of a file whose input is looked at for a period
-_FAR = 6.0  # standard deviations of the training input that most signals stay within
+_TRANSIENT = 3.0  # smallest ratio of the error in these samples to the later one in a transient
+_LOOKED_AT = 1_000_000  # largest number of samples of a file in which a period is looked for
+_FAR = 6.0  # standard deviations of the training input within which most signals stay
 
 
 class Start(NamedTuple):
-    """The state before the first sample, None for 0, samples that are not scored, and a note."""
+    """The state before the first sample (None for 0), samples that are not scored, and a note."""
 
     x0: Array | None
     skip: int
@@ -39,8 +39,8 @@ class Start(NamedTuple):
 def estimated_start(
     model: Model, stream: FileStream, *, samples: int | None = None, skip: int | None = None
 ) -> Start:
-    """Return the most probable start state, given the first measured outputs, not scored then."""
-    # ``samples``: how many are looked at; those that the user skips, or as many as of a record.
+    """Return the most probable start state given the first measured outputs, which do not score."""
+    # ``samples``: number of samples that are used. Default: skip, or as many as for a record.
     _require_outputs(stream, "estimated")
     asked = samples or skip
     u, y = _beginning(stream, asked or PART * WINDOW)
@@ -61,7 +61,7 @@ def estimated_start(
 
 
 def measured_start(model: Model, stream: FileStream, *, skip: int | None = None) -> Start:
-    """The state that the first measured output tells; that sample is not scored."""
+    """The state from the first measured output; that sample is not scored."""
     _require_outputs(stream, "measured")
     u, y = _beginning(stream, 2)
     if len(u) < 2 or not np.isfinite(y[0]).all():
@@ -74,7 +74,7 @@ def measured_start(model: Model, stream: FileStream, *, skip: int | None = None)
 
 
 def _require_outputs(stream: FileStream, start: str) -> None:
-    """Refuse a start that outputs tell if there are none."""
+    """Refuse a start that needs outputs if the file has none."""
     if not stream.y:
         raise InputError(
             f"start={start} needs measured outputs; name their columns with data.outputs=[...], "
@@ -96,10 +96,10 @@ def start_at_rest(stream: FileStream, *, skip: int | None = None) -> Start:
 
 
 def _beginning(stream: FileStream, samples: int) -> tuple[Array, Array]:
-    """The first inputs and outputs of a file, fewer if it has no more."""
+    """The first inputs and outputs of a file, fewer if the file is shorter."""
     u, y, count = [np.empty((0, len(stream.u)))], [np.empty((0, len(stream.y)))], 0
     for block in stream.blocks(samples):
-        u.append(block.u.copy())  # of a block with more columns
+        u.append(block.u.copy())  # a view would keep the whole block in memory
         y.append(block.y.copy())
         count += len(block.u)
         if count >= samples:
@@ -111,9 +111,9 @@ class Simulated(NamedTuple):
     """Result of the simulation of a file.
 
     Args:
-        samples, skip: written, and how many at the beginning are not scored.
+        samples, skip: number of samples written, and how many of these are not scored, at first.
         scores: scores of measured outputs after the skipped samples.
-        settled: the same without the first ``BEGINNING`` of those, either.
+        settled: scores without the first ``BEGINNING`` scored samples as well.
         peaks: largest inputs about the operating point, in standard deviations of the model's
             training inputs, (nu,).
     """
@@ -165,12 +165,12 @@ def simulate_file(
 
 
 def notes_on(result: Simulated, model: Model, *, estimated: bool) -> list[str]:
-    """Say what a user should know before the outputs are used."""
+    """Return what a user should know before using the outputs."""
     notes = [
         f"the input {channel.name} goes {number(peak)} standard deviations of the training "
         "input away from its mean: the model extrapolates there"
         for channel, peak in zip(model.inputs, result.peaks, strict=True)
-        if peak > _FAR and model.sizes["nz"]  # a linear model is the same at all amplitudes
+        if peak > _FAR and model.sizes["nz"]  # a linear model holds at all amplitudes
     ]
     scores, settled = result.scores, result.settled
     with np.errstate(invalid="ignore"):

@@ -175,5 +175,5 @@ def test_another_number_of_inputs_or_states_is_refused(found: dict[str, Any]):
 
 @pytest.mark.parametrize("name", ["known", "drag"])
 def test_a_map_without_arrays_has_no_matlab_code(name: str, tmp_path: Path):
-    with pytest.raises(InputError, match=r"this static map has no MATLAB code, .* export it to c"):
+    with pytest.raises(InputError, match=r"needs a network or a polynomial, .* map to c"):
         write(MODELS[name], "matlab", tmp_path)
