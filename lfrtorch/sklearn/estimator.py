@@ -28,17 +28,17 @@ class NLLFR(base.MultiOutputMixin, base.RegressorMixin, base.BaseEstimator):
     """A nonlinear LFR model: rows of X are samples of the inputs, in the order of time.
 
     Samples are not independent: a split must keep records whole, or in one piece. ``groups`` of
-    ``fit`` has the record of each row, and ``GroupKFold`` or ``LeaveOneGroupOut`` splits by it. The
-    records of ``fit`` have no test; the part held out by ``validation`` chooses the iterate.
-    ``predict`` simulates its rows as one record from x = 0, and ``score`` is R² of that.
+    ``fit`` names the record of each row, and ``GroupKFold`` or ``LeaveOneGroupOut`` splits by it.
+    ``fit`` has no test records; the part held out by ``validation`` chooses the iterate.
+    ``predict`` simulates its rows as one record from x = 0, and ``score`` is R² of that simulation.
 
     Args:
         nx, nz, nw, nn, starts, ridge, seed: as in :class:`lfrtorch.Settings`.
         max_iter: iterations of Levenberg-Marquardt.
-        fs: sampling frequency in Hz; it sets the unit of time of the model alone.
+        fs: sampling frequency in Hz; it only sets the unit of time of the model.
         start: start of a record of ``fit``, ``"zero"`` or ``"estimated"``; a prediction begins at
             x = 0, since there are no outputs.
-        skip: samples at the beginning of every record of ``fit`` that do not count.
+        skip: samples at the beginning of every record of ``fit`` that are not scored.
         validation: last part of each record, which chooses the iterate; 0 for none.
 
     Attributes:
