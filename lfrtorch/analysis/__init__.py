@@ -46,13 +46,13 @@ __all__ = [
 ]
 
 
-_LATER = {"plot": "lfrtorch.analysis.model_plots"} | {  # matplotlib takes its time
+_LATER = {"plot": "lfrtorch.analysis.model_plots"} | {  # importing matplotlib takes time
     name: "lfrtorch.guarantees" for name in ("Bound", "Contraction", "bound", "contraction")
 }
 
 
 def __getattr__(name: str) -> Any:
-    """Load the room of proofs, or figures, with the first use of one of them."""
+    """Load the module of proofs or figures at the first use of one of its names."""
     if name not in _LATER:
         raise AttributeError(name)
     return getattr(import_module(_LATER[name]), name)

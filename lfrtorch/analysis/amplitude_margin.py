@@ -14,7 +14,7 @@ LOUDER = (1.25, 1.5, 2.0)
 
 
 def largest_stable_amplitude(model: Model, records: Sequence[Record]) -> float:
-    """Return the largest of 1 and ``LOUDER`` up to which no output diverges; 0 if there is none.
+    """Return the largest of 1 and ``LOUDER`` at which no output diverges; 0 if 1 diverges already.
 
     Beyond the amplitudes that it was fitted at, a model's static nonlinearity may feed back more.
     """
@@ -24,7 +24,7 @@ def largest_stable_amplitude(model: Model, records: Sequence[Record]) -> float:
         for record in records:
             y = model.simulate(offset + factor * (record.u - offset))
             far = np.abs((y - model.scaler.y_offset) / scale)
-            if not (far < 100.0 * factor).all():  # it runs away; NaN counts
+            if not (far < 100.0 * factor).all():  # it diverges; also if NaN
                 return found
         found = factor
     return found

@@ -1,9 +1,9 @@
 """A model in coordinates that two fits of one system share, its static map without a linear part.
 
-The linear part of the static map may as well be in the linear block, and z, w and x may be scaled
-and mixed: many sets of weights are one model. The canonical form is the one of them in which
+The linear part of the static map can be moved into the linear block, and z, w and x can be scaled
+and mixed: many sets of weights are one model. The canonical form is the set for which
 
-- the affine map nearest to w(z) over the data has the slope 0: that is in A, Bu, Cy and Dyu;
+- the affine map nearest to w(z) over the data has slope 0: its slope is in A, Bu, Cy and Dyu;
 - z, w and x have unit covariance over the data (w about that constant);
 - the first w adds the most to the output, the first z bends the map the most, the first x is seen
   the most in y and z;
@@ -33,13 +33,13 @@ from lfrtorch.model.data_reach import whitening
 from lfrtorch.model.model import Model
 
 MOST_SAMPLES = 16_384
-"""Most samples of a record, its last ones, for covariances and the response to w."""
+"""Largest number of samples of a record, the last ones, for covariances and responses to w."""
 
 _ANGLES = 1024
 """Frequencies of impulse responses and of the observability Gramian."""
 
 _FLAT = 1e-12
-"""Least variance in a direction that is scaled to 1, relative to the largest."""
+"""Smallest variance, relative to the largest, of a direction that is scaled to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +50,12 @@ class Canonical:
         model: the same model in the canonical x = X x_before, with its static map f as it was.
         matrices: the linear block in the canonical x, z and w.
         slope: L, of the affine map nearest to f over the data.
-        X, Z, W: from the coordinates before to these; the map of the canonical z is
+        X, Z, W: transformations from the former coordinates; the map of the canonical z is
             w = W (f(Z⁻¹ z) - L Z⁻¹ z), see ``static``.
-        shares: part of the power that the nonlinearity adds to the normalised output, by w, if all
-            w had the mean of their spectra; 0 if it adds nothing.
-        bends: part of the mean squared change of the map's slope, by z; w counts by its share.
+        shares: share of each w in the power that the nonlinearity adds to the normalised output, if
+            all w had the mean of their spectra; 0 if it adds nothing.
+        bends: share of each z in the mean squared change of the map's slope; each w is weighted by
+            its share.
 
     Shape:
         slope: (nw, nz), X: (nx, nx), Z: (nz, nz), W: (nw, nw), shares: (nw,), bends: (nz,).
@@ -77,7 +78,7 @@ class Canonical:
 
     @torch.no_grad()
     def static(self, z: Float[Array, "S nz"]) -> Float[Array, "S nw"]:
-        """w of the canonical z: what the map is beyond a linear one."""
+        """Return w for canonical z: the map beyond its linear part."""
         z = z @ _inverse(self.Z).T
         w = double(self.model.lfr.cell).map(torch.as_tensor(z)).numpy()
         return (w - z @ self.slope.T) @ self.W.T
@@ -91,17 +92,17 @@ class Canonical:
 
 @typed()
 def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
-    """A model in its canonical form: the same for all weights that are the same model.
+    """Return a model in its canonical form, which all weights of the same model share.
 
-    Its static map is what is left of the model's beyond the nearest affine map over the records:
-    that is in the matrices instead. The model itself comes back in these x, to simulate and to be
-    saved, with the linear part in its map still: between u, x and y that changes nothing.
+    Its static map is the model's map less the nearest affine map over the records, which goes into
+    the matrices. ``model`` of the result is in these x as well, to simulate and to save, but keeps
+    the linear part in its map: between u, x and y that changes nothing.
 
     Args:
         model: nonlinear.
-        records: data that say where x and z are. Two models compare on the same data.
+        records: data that define x and z. Compare two models on the same data.
 
-    A direction of z or x that the data do not visit stays small, and is not unique. Neither are
+    Directions of z or x that the data do not visit stay small, and are not unique. Neither are
     directions that add the same power.
 
     Raises:
@@ -132,7 +133,7 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     left = np.concatenate(beyond)
     if not np.sum(left**2) > _FLAT * np.sum(w_all**2):
         raise InputError(
-            "the static map is affine over the records: nothing of it is nonlinear. "
+            "the static map is affine over the records: it has no nonlinear part. "
             "Give a model that was fitted, or records of larger inputs."
         )
     A, Bu, Cy, Dyu = fed_back(cell.matrices(), slope)
@@ -161,7 +162,7 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     X = turn.T @ X
     seen = seen @ turn
     largest = np.take_along_axis(seen, np.abs(seen).argmax(axis=0)[None], 0)
-    X = np.where(largest < 0, -1.0, 1.0).T * X  # what nobody sees keeps its sign
+    X = np.where(largest < 0, -1.0, 1.0).T * X  # a state that no output sees keeps its sign
     K = None if model.K is None else torch.as_tensor(X) @ model.K.double().cpu()
     same = replace(model, lfr=LFR(_in_coordinates(cell, X)), K=K)
     shares, bends = (part / max(part.sum(), 1e-300) for part in (power, bends))
@@ -213,9 +214,9 @@ def _ordered(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Arr
 
 
 def _response(M: Matrices, w: Float[Array, "T nw"]) -> Float[Array, "nw nw"]:
-    """Products of the responses in y from the entries of w, by the power that w has there.
+    """Products of the responses in y to the entries of w, weighted by the power of w there.
 
-    It is computed from frequency responses, which an unstable linear block has, too.
+    They are computed from frequency responses, which exist for an unstable linear block, too.
     """
     lines = np.asarray(np.fft.rfftfreq(len(w)), dtype=np.float64)
     z = np.exp(2j * np.pi * (lines + 0.5 / len(w)))  # between the lines: no pole at 1 is hit
@@ -225,7 +226,7 @@ def _response(M: Matrices, w: Float[Array, "T nw"]) -> Float[Array, "nw nw"]:
 
 
 def _signs(G: Complex128[Complex, "F n m"], axis: int) -> Float[Array, " K"]:
-    """The sign of the largest sample of the impulse responses of each row (1) or column (2)."""
+    """The sign of the largest impulse-response sample of each row (axis 1) or column (axis 2)."""
     turned = np.exp(-1j * np.pi * (np.arange(len(G)) / len(G)))  # frequencies lie between lines
     impulse = (np.fft.ifft(G, axis=0) / turned[:, None, None]).real
     each = np.moveaxis(impulse, axis, 0).reshape(G.shape[axis], -1)

@@ -2,11 +2,11 @@
 
 At the end of a fit θ_hat - θ = H⁻¹ Jᵀe to first order, with J the weighted rows of the model's
 output, H = JᵀJ, and e the noise. So the covariance of θ_hat is a sandwich, H⁻¹ (JᵀΓJ) H⁻¹. Γ is the
-covariance of the noise over time; it is taken from the residuals as an autoregressive process,
-for every record of its own size. (Lagged products of the scores J(t)ᵀe(t), which is the usual
-sandwich, need no model of the noise. In records of 300 samples they gave bands of 95 % that
-covered 80 to 91 %, as against 93 to 95 %.) What any number g(θ) of the model inherits is
-dg/dθ of that covariance. J is computed in the identifiable columns only (see ``gauge``).
+covariance of the noise over time. It is estimated from the residuals as an autoregressive process,
+with its own size for every record. (Lagged products of the scores J(t)ᵀe(t), the usual sandwich,
+need no model of the noise. In records of 300 samples their bands of 95 % covered 80 to 91 %, these
+cover 93 to 95 %.) Any number g(θ) of the model has an error of dg/dθ times the error of θ. J is
+computed in the identifiable columns only (see ``gauge``).
 """
 
 from __future__ import annotations
@@ -50,30 +50,30 @@ from lfrtorch.model.data_reach import FARTHEST
 from lfrtorch.model.model import Model
 
 _TRUNCATION = 1e-8
-"""Singular values of J, of columns of unit length, that count as zero relative to the largest."""
+"""Singular values of J, with columns of unit length, below this part of the largest count as 0."""
 
 _SHIFTED = 0.5
-"""Standard errors, rms over the directions, from which a doubt names a shift of the fit."""
+"""A note names a shift of the fit from so many standard errors on, rms over the directions."""
 
 _NEAR = 40.0
-"""Deviations of the noise from a limit, within which it can reach that."""
+"""The noise can reach a limit that is at most so many standard deviations away."""
 
 NOT_AT_MINIMUM = "the fit is not at its minimum"
-"""Beginning of the note on that shift."""
+"""Beginning of the note on a fit that is not at its minimum."""
 
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """A simulated output and how far it is known, in physical units.
+    """A simulated output and its uncertainty, in physical units.
 
     Args:
         outputs: the channels.
         y: simulated output.
-        std: standard deviation of y, as the parameters are not known exactly; a start state that
-            is estimated from the record adds its own.
+        std: standard deviation of y due to the uncertain parameters, and due to the start state if
+            that is estimated from the record.
         noise: standard deviation of the measurement noise.
-        surprises: distance of each sample from the data: 1 is the extent of the data; 99 %
-            of their samples are below. NaN if it is not known.
+        surprises: distance of each sample from the data; 1 is the distance within which 99 % of the
+            data's samples are. NaN if it is not known.
 
     Example:
         >>> band = lfrtorch.analysis.uncertainty(model, record).simulate(record)
@@ -90,7 +90,7 @@ class Band:
 
     @property
     def surprise(self) -> float:
-        """Surprise of the record: 99 % of its samples are below."""
+        """Surprise of the record: 99 % of its samples are below it."""
         return float(np.quantile(self.surprises, FARTHEST))
 
     def interval(
@@ -117,15 +117,15 @@ class Uncertainty:
     Args:
         model: the model, in float64 on the CPU.
         records: names of the records that it was fitted to.
-        samples: that were scored.
+        samples: number of scored samples.
         kept: parameters that vary, by their place among the free ones; the others are held, which
             changes no output.
-        factor: F, so that F Fᵀ is the covariance of these.
-        rank: directions of them that the data tell.
+        factor: F, so that F Fᵀ is the covariance of the kept parameters.
+        rank: number of directions of the kept parameters that the data determine.
         noise: standard deviation of the measurement noise, physical units.
         relative: mean standard deviation of the training outputs, over their rms.
         doubts: why the bands may be wrong; empty if nothing is known against them.
-        colour: the noise over time, normalised.
+        colour: model of the noise over time, normalised.
         reach: range of the data.
 
     Example:
@@ -268,8 +268,8 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
     The result simulates with bands and a surprise index, and gives linear models with covariance.
     It is computed again whenever it is needed: from ``lfrtorch.load(folder)`` and the same data.
 
-    The bands are those of the parameters and of noise that is independent of the inputs. They know
-    nothing of what the model cannot describe: ``doubts`` says so if the residuals show it.
+    The bands cover uncertain parameters, and noise that is independent of the inputs. They do not
+    cover what the model cannot describe: ``doubts`` says so if the residuals show it.
 
     Args:
         model: at the minimum of its fit.
@@ -307,7 +307,7 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
     none = cell.A.new_zeros(0, cell.nx)
     kept = reduction(cell, none, coordinates=not given, fixed=held_parameters(cell)).kept
     size = sum(record.y.size for record in listed) * (len(kept) + cell.nx)
-    hold = size <= 1 << 25  # numbers in memory rather than computed again
+    hold = size <= 1 << 25  # numbers that are kept in memory; more are computed again
     every = [Gradients(model, r, kept, fitted=True, hold=hold) for r in listed]
     for along in every:
         if not torch.isfinite(along.errors.square().sum()):
@@ -323,14 +323,14 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
     for along, own in zip(every, sizes, strict=True):
         for _, Q, _ in along.weighted():
             total.fold(own.coloured(Q))
-    # A direction that the data do not tell has the variance of the least one that they do.
+    # A direction that the data do not determine has the variance of the least determined one.
     untold = torch.diag(float(np.trace(colour.covariance)) / cell.ny * (1.0 - seen.square()))
     scatter, rank, zs, variances = root(untold + total.G), int((seen == 1).sum()), [], []
     for along in every:
         scored = slice(along.record.skip, None)
         parts = [(Q[..., : len(kept)] @ scatter).square().sum(-1) for _, Q in along.blocks()]
         if not along.group.spectral:
-            # As if the sample were not among those that the model is fitted to.
+            # Correct for the sample itself, as if the model were not fitted to it.
             taken = [Q.square().sum(-1) for _, Q, _ in along.weighted()]
             parts = [p / (1.0 - h).clamp_min(LEAST) for p, h in zip(parts, taken, strict=True)]
         zs.append(along.trajectory.z[0, scored].numpy())
@@ -356,9 +356,9 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
 def _directions(
     every: Sequence[Gradients], model: Model
 ) -> tuple[Float[Tensor, "K K"], Float[Tensor, " K"], tuple[float, float]]:
-    """W with orthonormal columns of J W, how much of each J sees (1: all), and the way left to go.
+    """W with orthonormal columns of J W, how much of each J sees (1: all), and the distance left.
 
-    The way left is that of a Gauss-Newton step: in standard errors, and of the cost.
+    The distance left is that of a Gauss-Newton step: in standard errors, and of the cost.
     """
     total, samples = QRAccumulator(), 0
     for along in every:
@@ -390,9 +390,9 @@ def _directions(
 def _noise(
     every: Sequence[Gradients],
 ) -> tuple[list[NoiseModel], NoiseModel, Float[Array, " ny"]]:
-    """The noise of each record as it is weighted, that of all of one size, and its deviations.
+    """The noise model of each record as weighted, of all with one size, and standard deviations.
 
-    Records share the colour, and have sizes of their own. Spectral lines are taken as independent.
+    Records share the colour, and each has its own size. Spectral lines count as independent.
     """
     ny = every[0].group.y.shape[2]
     spectra = Spectra(max(along.record.samples for along in every), ny)
@@ -417,7 +417,7 @@ def _noise(
         power += np.square((along.errors * counted[0]).numpy()).sum(axis=0)
     plain = [i for i, own in enumerate(colour_of) if own is a] or range(len(every))
     pooled = _ratio(*(np.sum([each[i] for i in plain], axis=0) for each in (products, left)))
-    # The spectra know better than n - p how much of the noise the fit took.
+    # The spectra tell better than n - p how much of the noise the fit has absorbed.
     known, gain = np.diag(pooled) > 0, np.ones(ny)
     if spectra.samples.any():
         gain[known] = np.sqrt(variances[known] / np.diag(pooled)[known])
@@ -478,11 +478,11 @@ def _doubts(
     rank: int,
     left: tuple[float, float],
 ) -> tuple[str, ...]:
-    """Sentences that say why the bands may be wrong."""
+    """Return sentences on why the bands may be wrong."""
     found = []
     wrong = _dependent(every, model)
     if wrong and len(every) > 1:
-        # Noise of a loud record, in the parameters, shows in the residuals of a quiet one.
+        # Noise of a loud record affects the parameters, and so the residuals of a quiet record.
         wrong = _dependent(every, model, _weighted_step(every, sizes))
     if wrong:
         part, name = min(wrong, key=lambda pair: pair[0].p[pair[1]])
@@ -507,7 +507,7 @@ def _doubts(
 def _clipped(
     every: Sequence[Gradients], scatter: Float[Tensor, "K m"], noise: Float[Tensor, " ny"]
 ) -> tuple[str, ...]:
-    """Shift of the fit by noise that the limits of a sensor cut off, if it is large."""
+    """Return a note on a large shift of the fit, by noise that the limits of a sensor cut off."""
     K, total = len(scatter), scatter.new_zeros(len(scatter))
     for along in every:
         if along.group.limits is None or not noise.all():
@@ -536,7 +536,7 @@ def _clipped(
 def _at_rest(
     model: Model, u: Float[Array, " nu"], rest: Float[Array, " nx"]
 ) -> Callable[[Weights], Sequence[Tensor]]:
-    """A, B, C and D about the rest under u, normalised, by all numbers of the model.
+    """A, B, C and D about the rest under u, normalised, as a function of all weights.
 
     One step of Newton's method from the rest, x + (I - F)⁻¹ (f(x, u) - x) with F held, has the same
     first derivatives as the rest itself.
@@ -554,10 +554,10 @@ def _at_rest(
 
 @typed()
 def spread(models: Sequence[Model], data: Record | ArrayLike) -> Band:
-    """The mean output of several models, and how far they differ.
+    """The mean output of several models, and their standard deviation.
 
-    Models of several starts, or those that a mean is of, differ in what the data do not tell.
-    ``std`` is their standard deviation; one model has none.
+    Models from several starts, or the members of an ensemble, differ in what the data do not
+    determine. ``std`` is their standard deviation; at least two models are needed.
 
     Args:
         models: two or more of the same channels and rate.

@@ -1,8 +1,8 @@
-"""Is a signal white, and does it depend on another one? Tests for noise of any distribution.
+"""Tests for noise of any distribution: is a signal white, and does it depend on another signal?
 
-Each correlation is divided by its own standard deviation: of Σ a(t) b(t-k) that is √Σ a(t)² b(t-k)²
-if a is white, whatever b is, and also if the variance of a changes with time, as that of a model's
-errors does. The usual 1/√T is too small then.
+Each correlation is divided by its own standard deviation: for Σ a(t) b(t-k) that is
+√Σ a(t)² b(t-k)² if a is white, whatever b is. This also holds if the variance of a changes with
+time, as it does for a model's errors; the usual 1/√T is too small then.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from lfrtorch._support.powers import near_one
 from lfrtorch._support.types import Array, Integers
 
 _NO_POWER = 1e-24
-"""Power of prediction errors over the signal's power, below which it is rounding."""
+"""Prediction errors with less than this part of the signal's power are rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +29,9 @@ class Correlation:
     Args:
         lags: samples by which the second signal is earlier.
         values: -1 to 1.
-        bounds: where a correlation of independent signals is with a probability of 99 %, ±.
-        p: probability of such correlations at lags from 0 on (of a signal with itself from 1 on) if
-            the signals are independent: below 0.01 they hardly are.
+        bounds: 99 % of the correlations of independent signals are within ± these.
+        p: probability of correlations as large as these at lags from 0 on (of a signal with itself:
+            from 1 on) if the signals are independent: below 0.01 they hardly are.
     """
 
     lags: Int64[Integers, " K"]
@@ -59,8 +59,8 @@ class Correlation:
 def autocorrelation(e: Float[Array, " T"], lags: int | None = None) -> Correlation:
     """Correlation of a signal with its own past, and a portmanteau test of whiteness.
 
-    The sum of the squared correlations, each over its standard deviation, is that of χ² with as
-    many degrees of freedom as lags if the signal is white (Dalla, Giraitis and Phillips, "Robust
+    The sum of the squared correlations, each over its standard deviation, is distributed as χ² with
+    as many degrees of freedom as lags if the signal is white (Dalla, Giraitis and Phillips, "Robust
     tests for white noise and cross-correlation", Econometric Theory 38(5), 2022).
     """
     e = e - e.mean()
@@ -75,8 +75,8 @@ def cross_correlation(e: Float[Array, " S"], x: Float[Array, " T"], lags: int) -
     Correlations of slow signals are large by chance, so both are white (Haugh, "Checking the
     independence of two covariance-stationary time series", Journal of the American Statistical
     Association 71(354), 1976). The test is on the largest score at lags from 0 on: by Šidák's
-    inequality it holds for inputs of any kind, also for those that no model makes white, as steps
-    and multisines. Correlations at negative lags mean that x follows e.
+    inequality it holds for inputs of any kind, also for steps and multisines, which no model makes
+    white. Correlations at negative lags mean that x follows e.
     """
     T = min(len(e), len(x))
     every = range(-lags, lags + 1)
@@ -89,14 +89,14 @@ def cross_correlation(e: Float[Array, " S"], x: Float[Array, " T"], lags: int) -
 def whitened(x: Float[Array, " T"]) -> Float[Array, " S"]:
     """Errors of predicting a signal from its past: white if an autoregressive model describes it.
 
-    By Burg's method (PhD thesis, Stanford University, 1975); Akaike's criterion chooses the order,
-    up to 10 log10 T, and as many samples are missing at the beginning.
+    The model is fitted by Burg's method (PhD thesis, Stanford University, 1975). Akaike's criterion
+    chooses its order, up to 10 log10 T; as many samples are missing at the beginning.
     """
     T = len(x)
     forward = backward = best = x - x.mean()
     power = _dot(best, best)
     least_power, order = _NO_POWER * power, 0
-    criterion = 0.0  # T log(power) + 2 order, relative to that of order 0
+    criterion = 0.0  # T log(power) + 2 order, relative to order 0
     least = 0.0
     while order < min(10 * math.log10(T), T // 4):
         forward, backward = forward[1:], backward[:-1]
@@ -131,14 +131,14 @@ def _correlated(
 
 
 def _dot(a: Float[Array, " T"], b: Float[Array, " T"]) -> float:
-    """Σ a b on one thread: those of BLAS wait long if other work has their processors."""
+    """Σ a b on one thread: BLAS threads wait long if other work has their processors."""
     return float(np.einsum("t,t->", a, b))
 
 
 def lags_for(T: int, lags: int | None = None) -> int:
     """Number of lags in a test of T samples."""
     if lags is None:
-        # 25 as in MATLAB's ``resid``; with 20 samples a lag whiteness is rejected in 1.5 % at 1 %.
+        # 25 as in MATLAB's ``resid``. With 20 samples a lag, a 1 % test rejects whiteness in 1.5 %.
         return min(25, max(5, T // 40))
     integer("lags", lags, 1)
     return min(lags, T // 2)

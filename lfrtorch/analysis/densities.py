@@ -14,13 +14,13 @@ from lfrtorch.data.records import Record
 from lfrtorch.linear.spectra import Spectra, spectra_of_periods
 
 _SEGMENT = 4096
-"""Most samples of a segment of Welch's method."""
+"""Largest number of samples of a segment of Welch's method."""
 
 SHORTEST = 16
-"""Fewest samples of a segment of Welch's method."""
+"""Smallest number of samples of a segment of Welch's method."""
 
 _STRETCHES = 256
-"""Most frequencies of the density of noise, which is a mean over the lines about each."""
+"""Largest number of frequencies of the noise density; each is a mean over neighbouring lines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def noise_of_periods(records: Sequence[Record]) -> Float[Array, " ny"] | None:
 def noise_density(
     record: Record,
 ) -> tuple[Float[Array, " F"], Float[Array, "F ny"], Float[Array, " ny"]] | None:
-    """Frequencies in Hz, power spectral densities and deviations of the repeated noise, or None."""
+    """Frequencies in Hz, power spectral densities and rms of the noise between periods, or None."""
     spectra = _steady_spectra([record])
     if spectra is None:
         return None
@@ -73,7 +73,7 @@ def noise_density(
 
 
 def _steady_spectra(records: Sequence[Record]) -> Spectra | None:
-    """Spectra of periods whose differences are noise."""
+    """Spectra of periods if these differ by noise alone, or None."""
     try:
         spectra = spectra_of_periods(records)
     except ValueError:
@@ -88,9 +88,9 @@ def _noise_power(spectra: Spectra) -> Float[Array, "F ny"]:
 
 
 def _steady(record: Record, N: int) -> bool:
-    """Tell if differences between successive periods of N samples have the same power in time.
+    """Tell if the differences of successive periods of N samples have a steady power over time.
 
-    The first of two periods may have a transient, which is no noise.
+    The first of two periods may have a transient, which is not noise.
     """
     count = (record.samples - record.skip) // N
     if count < 2:

@@ -1,9 +1,9 @@
-"""Derivatives of a simulated output along a record, by the parameters that the data can tell.
+"""Derivatives of a simulated output along a record, by the parameters that the data determine.
 
 The columns are those of ``gauge``: the other parameters are held, which changes no output. The
-start state moves with the parameters: the one of a periodic record is its end; an estimated one is
-the one that fits best, which moves by dx0 = -(W X)⁺ W J dθ for rows X of the start state, J of the
-parameters and weights W. Rows of the model's output are then J + X dx0/dθ.
+start state moves with the parameters. For a periodic record it is the end state. An estimated start
+state is the one that fits best. It moves by dx0 = -(W X)⁺ W J dθ, with rows X of the start state,
+rows J of the parameters and weights W. The rows of the output are then J + X dx0/dθ.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.model.model import Model
 
 _SEEN = 1e-9
-"""Directions of a start state that move the output by less than this, relative to others, stay."""
+"""Directions of a start state that move the output by less than this, relatively, are held."""
 
 
 class Gradients:
@@ -49,7 +49,7 @@ class Gradients:
         errors = SimulationErrors(model.lfr.cell, records, solve_initial_states=not fitted)
         self.record, self.kept = record, kept
         self.basis: Tensor | None = None
-        """Directions (K, m) of the kept parameters, whose columns ``blocks`` yields instead."""
+        """Directions (K, m) of the kept parameters; ``blocks`` yields their columns if given."""
         _, (self.trajectory,) = errors.evaluate(errors.first_theta())
         self.group: RecordGroup = errors.groups[0].counted(self.trajectory.y)
         periodic, self.estimated = self.group.start.periodic, self.group.start.fitted
@@ -76,11 +76,11 @@ class Gradients:
 
     @property
     def errors(self) -> Float[Tensor, "T ny"]:
-        """Simulated less measured output."""
+        """Simulated minus measured output."""
         return (self.trajectory.y - self.group.y)[0]
 
     def blocks(self) -> Iterator[tuple[slice, Float[Tensor, "B ny C"]]]:
-        """Samples and their rows; nx columns of an estimated start state follow the others."""
+        """Yield samples and their rows; nx columns of an estimated start state come last."""
         K = len(self.kept)
         for time, rows in self._held or self._moved():
             if self.basis is None:
@@ -101,7 +101,7 @@ class Gradients:
             yield time, rows
 
     def weighted(self) -> Iterator[tuple[slice, Float[Tensor, "m ny K"], Float[Tensor, "m ny"]]]:
-        """Those columns and the errors, weighted as in a fit; real, then imaginary if by line."""
+        """Yield columns and errors, weighted as in a fit; by line real, then imaginary parts."""
         group, m = self.group, len(self.kept) if self.basis is None else self.basis.shape[1]
         for time, rows in self.blocks():
             part, errors = rows[None, ..., :m], self.errors[None, time]
@@ -133,6 +133,6 @@ class Gradients:
 
 
 def root(G: Float[Tensor, "n n"]) -> Float[Tensor, "n n"]:
-    """R with R Rᵀ = G, of a matrix that is positive semidefinite but for rounding errors."""
+    """R with R Rᵀ = G, for a matrix that is positive semidefinite up to rounding errors."""
     values, vectors = torch.linalg.eigh((G + G.mT) / 2)
     return vectors * values.clamp_min(0.0).sqrt()

@@ -17,7 +17,7 @@ from lfrtorch.linear.resolvent import known
 
 @dataclass(frozen=True, eq=False)
 class ResponseBand:
-    """A frequency response and how far it is known, in physical units.
+    """A frequency response and its uncertainty, in physical units.
 
     Args:
         frequencies: in Hz.
@@ -46,7 +46,7 @@ class ResponseBand:
 
     @property
     def magnitude_std(self) -> Float[Array, "F ny nu"]:
-        """Standard deviation of |G|: of G along itself."""
+        """Standard deviation of |G|, to first order."""
         size = np.where(self.magnitude > 0, self.magnitude, 1.0)
         along = np.stack([self.response.real, self.response.imag], -1) / size[..., None]
         variance = np.einsum("...i,...ij,...j->...", along, self.covariance, along)
@@ -55,7 +55,7 @@ class ResponseBand:
 
 @dataclass(frozen=True)
 class PoleBand:
-    """A pole, or a conjugate pair, and how far it is known.
+    """A pole, or a conjugate pair, and its uncertainty.
 
     Args:
         pole: in the z plane, with an imaginary part of 0 or more.
@@ -82,7 +82,7 @@ def response_band(model: LinearModel, frequencies: ArrayLike) -> ResponseBand:
     """Frequency response with its covariance.
 
     Args:
-        model: a model with a covariance, as ``Uncertainty.linearise`` or ``estimate_bla`` gives it.
+        model: a model with a covariance, from ``Uncertainty.linearise`` or ``estimate_bla``.
         frequencies: (F,) in Hz.
 
     Raises:
@@ -100,11 +100,11 @@ def response_band(model: LinearModel, frequencies: ArrayLike) -> ResponseBand:
 def pole_bands(model: LinearModel) -> tuple[PoleBand, ...]:
     """Poles with their standard deviations, by frequency; a conjugate pair counts once.
 
-    To first order: those of poles that lie together, or of a real pair that may be a complex one,
-    say little.
+    The standard deviations are of first order: for poles that lie together, or for a real pair that
+    may be a complex pair, they say little.
 
     Args:
-        model: a model with a covariance, as ``Uncertainty.linearise`` or ``estimate_bla`` gives it.
+        model: a model with a covariance, from ``Uncertainty.linearise`` or ``estimate_bla``.
 
     Raises:
         ValueError: a model without covariance.

@@ -27,24 +27,24 @@ def linearise(
 ) -> LinearModel:
     """The model linearised about an operating point, in physical units.
 
-    Let u0 hold the model in the state x0, x0 = f(x0, u0). The deviations obey::
+    Let the input u0 hold the model in the state x0: x0 = f(x0, u0). The deviations obey::
 
         x+ = A x + B (u - u0) + K e
         y  = C x + D (u - u0) + y0 + e
 
-    to first order: the error is quadratic in them. u0, y0 and x0 are ``u_offset``, ``y_offset`` and
-    ``x_offset`` of the result, and K is that of a model in innovation form. So a state feedback is
-    u = u0 - F (observer.state - x0). ``to_scipy`` and ``to_control`` of the result
-    hand the matrices on. The rest may be unstable, and is then of use to a controller.
+    to first order: the error is quadratic in the deviations. u0, y0 and x0 are ``u_offset``,
+    ``y_offset`` and ``x_offset`` of the result, and K is the gain of a model in innovation form. So
+    a state feedback is u = u0 - F (observer.state - x0). ``to_scipy`` and ``to_control`` of the
+    result convert it. The rest may be unstable: a controller may stabilise it.
 
     Args:
         model: nonlinear.
-        u: constant input u0, physical units, or what ``trim`` found. Default: the inputs' offsets
-            in the data, or of an integrating model the inputs next to them that hold it at rest.
+        u: constant input u0, physical units, or the result of ``trim``. Default: the offsets of the
+            inputs in the data; for an integrating model, the nearest inputs that hold it at rest.
         x: state x0 in the model's coordinates, as ``model.signals(record).x[0, k]``. If u0 does not
-            hold the model there, the result is of the deviations from the trajectory that passes
-            through it. Default: the state at rest, by Newton's method; if there are several, the
-            one it comes to from x = 0.
+            hold the model there, the deviations are from the trajectory through x0. Default: the
+            state at rest, by Newton's method; if there are several, the one that is reached from
+            x = 0.
 
     Shape:
         u: (nu,) or a number for one input, x: (nx,).
@@ -81,7 +81,7 @@ def linearise(
 def about(
     model: Model, u: ArrayLike | None, x: ArrayLike | None
 ) -> tuple[LFRCell, Array, Tensor, Tensor | None]:
-    """The cell of a model, a given input or the offsets, the same normalised, and a given state."""
+    """Return the cell, the input u0 (given, or the offsets), the same normalised, and a given x."""
     cell, s = double(model.lfr.cell), model.scaler
     u0 = s.u_offset if u is None else vector("u", u, cell.nu, "the model has {} input(s)")
     given = None if x is None else vector("x", x, cell.nx, "the model has {} states")

@@ -1,8 +1,9 @@
-"""The model as one that is linear in x and u and varies with parameters: the exact LPV form.
+"""The exact LPV form: the model as one that is linear in x and u, with varying parameters.
 
-Let z - z0 = ζ. The static map is f(z) = f(z0) + Δ(ζ) ζ, Δ = ∫ f'(z0 + t ζ) dt over t from 0 to 1.
-A network has Δ = Ww diag(s) Wz with the mean slopes s = (σ(v0 + d) - σ(v0)) / d of the neurons
-between v0 and v0 + d, d = Wz ζ. A mean slope lies between the least and the largest slope, so the
+Let ζ = z - z0. The static map is f(z) = f(z0) + Δ(ζ) ζ with Δ = ∫ f'(z0 + t ζ) dt, t from 0 to 1.
+A network has Δ = Ww diag(s) Wz, where s = (σ(v0 + d) - σ(v0)) / d are the mean slopes of its
+neurons between v0 and v0 + d, d = Wz ζ. A mean slope lies between the smallest and the largest
+slope, so the
 parameters of the form are bounded.
 """
 
@@ -30,7 +31,7 @@ from lfrtorch.maps.mean_slopes import Neurons
 from lfrtorch.model.model import Model
 
 _ROUNDING = 1e-14
-"""Error of f(z) - f(z0), relative to both, that is one of rounding."""
+"""Errors of f(z) - f(z0) below this part of both are rounding errors."""
 
 Slopes = Callable[[Float[Array, "S nz"]], Float[Array, "S P"]]
 
@@ -42,18 +43,18 @@ class LPV:
         x+ = x_next0 + A(p) (x - x0) + B(p) (u - u0)
         y  = y0      + C(p) (x - x0) + D(p) (u - u0)
 
-    A(p) = A[0] + p_1 A[1] + p_2 A[2] + .., and so B, C and D. It is the model itself, not an
-    approximation, if p = scheduling(x, u). At rest x_next0 = x0.
+    A(p) = A[0] + p_1 A[1] + p_2 A[2] + .., and likewise B, C and D. With p = scheduling(x, u) the
+    form is the model itself, not an approximation. At rest x_next0 = x0.
 
     Args:
         A, B, C, D: matrices; the first axis counts the parameters from 1.
-        bounds: least and largest value of each p, whatever x and u; infinite if none is known.
+        bounds: smallest and largest value of each p for all x and u; infinite if not known.
         schedule: kind of p: ``"neurons"`` or ``"map"``.
-        x0, u0, x_next0, y0: the point that deviations are counted from, with the next state and the
-            output there.
+        x0, u0, x_next0, y0: the point from which deviations count, with the next state and the
+            output at that point.
         Cz, Dzu: z - z0 = Cz (x - x0) + Dzu (u - u0).
-        slopes: z - z0 -> p.
-        model: that it is the form of.
+        slopes: function from z - z0 to p.
+        model: the model in LPV form.
 
     Example:
         >>> form = lfrtorch.analysis.lpv(model)
@@ -79,7 +80,7 @@ class LPV:
     def scheduling(
         self, x: Float[Array, "*axes nx"], u: Float[Array, "*axes nu"]
     ) -> Float[Array, "*axes P"]:
-        """Compute p of states and inputs."""
+        """Compute p for states and inputs."""
         zeta = (x - self.x0) @ self.Cz.T + (u - self.u0) @ self.Dzu.T
         points = zeta.reshape(int(np.prod(zeta.shape[:-1])), len(self.Cz))
         return self.slopes(points).reshape(*zeta.shape[:-1], len(self.bounds))
@@ -87,10 +88,10 @@ class LPV:
     def seen(self, records: Record | Sequence[Record]) -> Float[Array, "V P"]:
         """Corners of a box that holds all p of the model's simulations of records.
 
-        The box lies along the axes of p or along the principal ones of their cloud, whichever is
-        smaller. The matrices at its corners, ``form.at(p)``, are the vertices of a polytope for
-        controllers and proofs in the region of the data; directions in which p do not move have no
-        corners.
+        The box lies along the axes of p or along the principal axes of their cloud, whichever box
+        is smaller. The matrices at its corners, ``form.at(p)``, are the vertices of a polytope for
+        controllers and proofs in the region of the data. Directions in which p does not move have
+        no corners.
 
         Example:
             >>> form = lfrtorch.analysis.lpv(model, schedule="map")
@@ -129,14 +130,14 @@ class LPV:
         return self.x_next0 + A @ dx + B @ du, self.y0 + C @ dx + D @ du
 
     def simulate(self, u: ArrayLike, x0: Float[Array, " nx"] | None = None) -> Float[Array, "T ny"]:
-        """Output of an input.
+        """Simulate the output for an input.
 
         Args:
             u: the input, physical units.
             x0: initial state in the model's coordinates. Default: 0, as ``model.simulate``.
 
         Shape:
-            u: (T, nu), or (T,) of one input.
+            u: (T, nu), or (T,) for one input.
 
         Raises:
             ValueError: an input of another shape.
@@ -172,15 +173,15 @@ def lpv(
     Args:
         model: nonlinear or linear (then there is no p).
         u: constant input u0. Default: the inputs' offsets in the data.
-        x: state x0 in the model's coordinates. Default: the one at rest under u0, so that the form
-            has no constant terms; 0 if there is none.
+        x: state x0 in the model's coordinates. Default: the state at rest under u0, so that the
+            form has no constant terms; 0 if there is none.
         schedule: kind of p. ``"neurons"``: the mean slope of each neuron of a network.
-            ``"map"``: the entries of Δ, by rows (w1 z1, w1 z2, .., w2 z1, ..), of any static map; a
-            network with fewer of them than neurons is better off with them. Default: the neurons of
-            a network, the map of others.
+            ``"map"``: the entries of Δ by rows (w1 z1, w1 z2, .., w2 z1, ..), for any static map;
+            better for a network that has fewer such entries than neurons. Default: ``"neurons"``
+            for a network, ``"map"`` for other maps.
 
-    A map that is no network and no polynomial is integrated by a Gauss-Legendre rule with 32 nodes;
-    what the rule leaves goes along ζ, so that f(z0) + Δ ζ is exact.
+    A map other than a network or a polynomial is integrated by a Gauss-Legendre rule with 32 nodes.
+    The rule's error is added to Δ along ζ, so that f(z0) + Δ ζ is exact.
 
     Shape:
         u: (nu,) or a number for one input, x: (nx,).
@@ -202,7 +203,7 @@ def lpv(
         raise InputError(f"schedule is {schedule!r}; give 'neurons' or 'map'.")
     if schedule == "neurons" and neurons is None:
         raise InputError(
-            "schedule is 'neurons', and the static map is no network; give schedule='map'."
+            "schedule is 'neurons', but the static map is not a network; give schedule='map'."
         )
     schedule = schedule or ("map" if neurons is None else "neurons")
     if x0 is None and (x0 := equilibrium(cell, v0)) is None:
@@ -232,7 +233,7 @@ def lpv(
 def _slopes(
     cell: LFRCell, z0: Float[Array, " nz"], neurons: Neurons | None
 ) -> tuple[Array, Array, Float[Array, "P 2"], Slopes]:
-    """L (nw, P), R (P, nz), bounds and p(ζ) of Δ = L diag(p) R; its entries without neurons."""
+    """L (nw, P), R (P, nz), bounds and p(ζ) of Δ = L diag(p) R; without neurons p is Δ by rows."""
     if neurons is not None:
         return *neurons[:3], lambda zeta: neurons.mean_slopes(z0, zeta)
     nw, nz, found = cell.nw, cell.nz, cell.map.neurons
@@ -261,7 +262,7 @@ def _left_over(
     zeta: Float[Array, "S nz"],
     delta: Float[Array, "S nw nz"],
 ) -> Float[Array, "S nw nz"]:
-    """Least change of Δ that makes f(z0) + Δ ζ exact."""
+    """Smallest change of Δ that makes f(z0) + Δ ζ exact."""
     f = cell.map(torch.as_tensor(np.concatenate([z0[None], z0 + zeta]))).numpy()
     error = f[1:] - f[0] - np.einsum("swz,sz->sw", delta, zeta)
     error[np.abs(error) <= _ROUNDING * (np.abs(f[1:]) + np.abs(f[0]))] = 0.0

@@ -37,10 +37,10 @@ from lfrtorch.model.data_reach import whitening
 from lfrtorch.model.model import Model
 
 _MOST_MAPS = 4
-"""Outputs of the static map that are drawn."""
+"""Number of outputs of the static map that are drawn."""
 
 _GRID = 121
-"""Points of a curve, and of each side of a plane."""
+"""Number of points of a curve, and of each side of a plane."""
 
 _HEIGHT = 2.7
 """Height of a panel, in inches."""
@@ -50,10 +50,10 @@ _LEAST_HEIGHT = 3.6
 
 
 class _Visited(NamedTuple):
-    """Where the static map is used, and its nearest affine map there.
+    """The region in which the static map is used, and its nearest affine map there.
 
-    z (S, nz) are its inputs and w = slope z + offset is that map; ``nonlinear`` is the part of the
-    rms of each w (about its mean) that it leaves; ``known`` says whether z are from data.
+    z (S, nz) are its inputs, and w = slope z + offset is the affine map. ``nonlinear`` is the part
+    of the rms of each w (about its mean) that this leaves; ``known`` says whether z come from data.
     """
 
     z: Float[Array, "S nz"]
@@ -67,14 +67,14 @@ class _Visited(NamedTuple):
 def plot(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:
     """Figure of a model: frequency responses, poles, and the nonlinearity of its static map.
 
-    Responses and poles are those of the linear part and of the model linearised at rest at the
-    inputs' offsets. The static map is drawn less the affine map that is nearest to it over the
-    data, as that belongs to the linear part: over z1, over the plane of z1 and z2, or of more z
-    along the direction in which it is the least linear.
+    Responses and poles are those of the linear part, and of the model linearised at rest at the
+    inputs' offsets. The static map is drawn minus the affine map nearest to it over the data, as
+    that belongs to the linear part: over z1, over the plane of z1 and z2, or, for more z, along the
+    direction in which it is least linear.
 
     Args:
         model: nonlinear.
-        records: data that say where z is. Default: white noise of the rms of the training inputs.
+        records: data that define z. Default: white noise with the rms of the training inputs.
 
     Raises:
         ValueError: records of other channels than the model's, or a model that diverges on them.
@@ -103,7 +103,7 @@ def plot(model: Model, records: Record | Sequence[Record] | None = None) -> Figu
 
 
 def static_figure(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:
-    """The last part of that figure alone: the nonlinearity of the static map."""
+    """The last part of the figure of ``plot``: the nonlinearity of the static map."""
     static = _drawn(model)
     if not static.nw:
         raise InputError("the model is linear and has no static map to draw.")
@@ -115,7 +115,7 @@ def static_figure(model: Model, records: Record | Sequence[Record] | None = None
 
 
 def _drawn(model: Model) -> StaticMap:
-    """The map that is learned, beside a known model or alone; or a known model."""
+    """The learned map, beside a known model or alone; or else the known model."""
     static = double(model.lfr.cell).map
     return static.learned if static.learned.nw else static
 
@@ -128,7 +128,7 @@ def visited(model: Model, static: StaticMap, records: Record | Sequence[Record] 
     else:
         signals = as_records(records)
     z = np.concatenate([model.signals(one).z[0].double().numpy() for one in signals])
-    z = z[:: 1 + len(z) // 20_000, z.shape[1] - static.nz :]  # of what is learned, the last
+    z = z[:: 1 + len(z) // 20_000, z.shape[1] - static.nz :]  # z of the learned map come last
     if not np.isfinite(z).all():
         raise InputError(
             "the model diverges on the records; give others." if records is not None else
@@ -227,10 +227,10 @@ def _maps(part: Figure | SubFigure, static: StaticMap, where: _Visited, count: i
 
 
 def most_nonlinear(static: StaticMap, where: _Visited, j: int) -> tuple[Float[Array, " S"], float]:
-    """Where z is along the direction in which output j of the map changes its slope most, its part.
+    """Return z along the direction in which output j changes its slope most, and its share.
 
-    It is the leading eigenvector of the mean of g gᵀ, g the slope less its mean, where z has unit
-    covariance (Constantine, "Active Subspaces", SIAM, 2015).
+    The direction is the leading eigenvector of the mean of g gᵀ, where g is the slope minus its
+    mean and z has unit covariance (Constantine, "Active Subspaces", SIAM, 2015).
     """
     T = whitening(where.z)
     z, phi = torch.as_tensor(where.z)[None], static.flat_weights().detach()

@@ -1,9 +1,10 @@
 """Noise model of the outputs, estimated from residuals: autoregressive, of any colour.
 
-The residuals of a fit are less than the noise, where the model is flexible more so than elsewhere:
-of the noise's power at a frequency a fit takes the part ρ(f) = Σ |q(f)|² / T, with q the
-orthonormal columns of its Jacobian. The spectrum of the residuals is divided by 1 - ρ(f), which is
-what n - p is for white noise. The noise of several outputs may be correlated at the same sample.
+The residuals of a fit are smaller than the noise, the more so where the model is more flexible. At
+each frequency a fit absorbs the part ρ(f) = Σ |q(f)|² / T of the noise's power, with q the
+orthonormal columns of its Jacobian. So the spectrum of the residuals is divided by 1 - ρ(f), which
+for white noise is the usual n - p. The noise of several outputs may be correlated at the same
+sample.
 """
 
 from __future__ import annotations
@@ -21,23 +22,23 @@ from torch import Tensor
 from lfrtorch._support.types import Array
 
 _SEGMENT = 1024
-"""Longest stretch of which a spectrum is taken, in samples."""
+"""Length of the longest stretch for a spectrum, in samples."""
 
 LEAST = 0.1
-"""Lower bound of the part 1 - ρ of the noise that remains in the residuals."""
+"""Lower bound for the part 1 - ρ of the noise that remains in the residuals."""
 
 _NO_POWER = 1e-24
-"""Power of prediction errors over the residuals' power, below which it is rounding."""
+"""Prediction errors with less than this part of the residuals' power are rounding."""
 
 _FADED = 1e-4
-"""Part of an impulse response below which it ends."""
+"""An impulse response ends when it is below this part."""
 
 _LONGEST = 2048
-"""Most samples of an impulse response."""
+"""Largest number of samples of an impulse response."""
 
 
 class Spectra:
-    """Spectra of residuals and of what the fit took of the noise, summed over stretches."""
+    """Spectra of residuals, and of the noise that the fit absorbed, summed over stretches."""
 
     def __init__(self, longest: int, ny: int) -> None:
         self.segment = min(_SEGMENT, longest)
@@ -45,7 +46,7 @@ class Spectra:
         self.samples = np.zeros(ny)
 
     def add(self, errors: Float[Array, "m ny"], Q: Float[Array, "m ny K"]) -> None:
-        """A block of residuals and of the rows of Q; rows that do not count are zeros."""
+        """Add a block of residuals and of the rows of Q; rows that do not count are zeros."""
         for first in range(0, len(errors), self.segment):
             part = slice(first, first + self.segment)
             counted = np.any(Q[part], axis=2).sum(axis=0)
@@ -74,7 +75,7 @@ class NoiseModel:
     covariance: Float[Array, "ny ny"]
 
     def coloured(self, Q: Float[Tensor, "m ny K"]) -> Float[Tensor, "m2 K"]:
-        """Rows V with VᵀV = QᵀΓQ, Γ the covariance of the noise of all samples.
+        """Rows V with VᵀV = QᵀΓQ, where Γ is the covariance of the noise of all samples.
 
         Σ q(t) e(t) = Σ (Σ_j ψ_j q(s + j)) ε(s): the impulse responses ψ of 1 / a(q) run backwards.
         """
@@ -114,13 +115,13 @@ def colours(spectra: Spectra) -> tuple[tuple[Array, ...], Float[Array, " ny"]]:
 
 
 def innovations(a: Sequence[Array], errors: Float[Array, "m ny"]) -> Float[Array, "m ny"]:
-    """ε of residuals e."""
+    """ε for residuals e."""
     each = [scipy.signal.lfilter(own, [1.0], e) for own, e in zip(a, errors.T, strict=True)]
     return np.stack(each, axis=1)
 
 
 def _memory(a: Array) -> int:
-    """Samples in which the impulse response of 1 / a fades."""
+    """Number of samples until the impulse response of 1 / a has decayed."""
     radius = np.abs(np.roots(a)).max(initial=0.0)
     if radius >= 1.0:
         return _LONGEST

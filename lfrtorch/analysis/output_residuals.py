@@ -18,10 +18,10 @@ LEVEL = 0.01
 """Significance level of the tests of independence."""
 
 ROUNDING = 1e-12
-"""Errors below this part of the output's rms are rounding errors, and so are such means."""
+"""Errors, and means of errors, below this part of the output's rms are rounding errors."""
 
 SLIGHT = 0.1
-"""Correlations below this are 1 % of the power at most; only long records show them."""
+"""Correlations below this have at most 1 % of the power; only long records show them."""
 
 
 FINDINGS = {
@@ -45,11 +45,11 @@ class OutputResiduals:
             constant output.
         whiteness: correlation of the error with its own past.
         linear: correlation of the error with each input.
-        even: correlation with the square of each input: even nonlinearities that are left.
-        odd: the same for error times simulated output: odd ones that are left, or a gain.
+        even: correlation of the error with the square of each input: missing even nonlinearities.
+        odd: the same for the error times the simulated output: missing odd nonlinearities, or gain.
         densities: spectra of output, error and noise.
         noise: standard deviation of the noise, if the record repeats.
-        exact: True if the error is one of rounding.
+        exact: True if the error is a rounding error.
     """
 
     record: str
@@ -85,7 +85,7 @@ class OutputResiduals:
     def p(self) -> dict[str, float]:
         """Probabilities of the tests ``white``, ``inputs``, ``even`` and ``odd``.
 
-        Those of several inputs are the least, times the number of inputs.
+        For several inputs they are the smallest one, times the number of inputs.
         """
         return {"white": self.whiteness.p} | {
             name: min(1.0, len(each) * min(c.p for c in each)) for name, each in self.tests.items()

@@ -1,4 +1,4 @@
-"""The parameters of a known model: values, standard errors, and what the data cannot tell apart."""
+"""Parameters of a known model: values, standard errors, and what the data cannot tell apart."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from lfrtorch.data.records import Record, as_records
 from lfrtorch.model.model import Model
 
 _ALIKE = 0.95
-"""Correlation from which a note names two parameters."""
+"""Smallest correlation at which a note names two parameters."""
 
 _TAKEN_OVER = 5.0
-"""Standard error relative to that with the learned part held, from which a note says so."""
+"""A note names a parameter whose standard error is so many times that with a fixed learned part."""
 
 _AT_BOUND = 1e-6
-"""Distance from a bound, of the parameter's scale, that is none."""
+"""A parameter is at a bound if it is closer than this part of its scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +34,10 @@ class PhysicalParameters:
     Args:
         names, units: names and units of the parameters.
         values: as fitted.
-        errors: standard errors, of noise that may have a colour; NaN if they are not known.
+        errors: standard errors for noise of any colour; NaN if not known.
         correlation: correlation of the estimates.
-        alone: standard errors if the learned part were known, as far as that has a meaning.
-        notes: remarks on them; empty if there are none.
+        alone: standard errors if the learned part were known, where that has a meaning.
+        notes: remarks on the parameters; empty if there are none.
 
     Shape:
         values, errors, alone: (n,), correlation: (n, n).
@@ -84,17 +84,17 @@ def physical_parameters(
 ) -> PhysicalParameters:
     """The parameters of a fitted known model, with standard errors.
 
-    These are the errors by noise, corrected for its colour, of all that was fitted together: what
-    the learned part can say as well as a parameter makes its error large.
+    The errors are due to noise, corrected for its colour, in all that was fitted together: if the
+    learned part can replace a parameter, the error of that parameter is large.
 
     Args:
         model: a model with known equations.
         records: records of the fit, with starts, skips and weights as in the fit.
-        ridge: that of the fit; as it says how far parameters may be from where the search began, it
-            tells apart what the data do not.
+        ridge: ridge of the fit; it limits how far parameters move from where the search began, and
+            so separates what the data do not.
 
     Raises:
-        ValueError: a model that has no known part.
+        ValueError: a model without known equations.
 
     References:
         Ljung, "System Identification: Theory for the User", 2nd ed., 1999, chapter 9.

@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LEAST = 1e-4
-"""Smallest probability that is printed."""
+"""Smallest probability that is printed as a number."""
 
 SHORTEST = 20
-"""Fewest scored samples of a record."""
+"""Smallest number of scored samples of a record."""
 
 _MOST_ROWS = 24
-"""Most rows of a printed table, those of the least fit."""
+"""Largest number of rows of a printed table; the rows of the worst fit are kept."""
 
 LEGEND = (
     "fit: 100 (1 - |y - y_hat| / |y - mean y|), of the scored samples.\n"
@@ -60,19 +60,19 @@ class Residuals:
 
     @property
     def worst(self) -> str:
-        """Name of the record with the least fit of an output; of one that diverges, if any."""
+        """Name of the record with the worst fit of an output; one that diverges comes first."""
         return min(self.parts, key=_goodness).record
 
     def of(self, record: str) -> tuple[OutputResiduals, ...]:
         """The parts of one record.
 
         Raises:
-            ValueError: there is none of that name.
+            ValueError: there is no record of that name.
         """
         found = tuple(part for part in self.parts if part.record == record)
         if not found:
             names = ", ".join(dict.fromkeys(part.record for part in self.parts))
-            raise InputError(f"there is no record '{record}' among the residuals; give of {names}.")
+            raise InputError(f"there is no record '{record}' among the residuals; give {names}.")
         return found
 
     @property
@@ -81,7 +81,7 @@ class Residuals:
         return [part for part in self.parts if id(part) in kept]
 
     def rows(self) -> tuple[list[str], list[list[str | int | float]]]:
-        """Head and rows of the table, the parts in their order; of many those of the least fit."""
+        """Head and rows of the table, the parts in order; if there are many, the worst fits."""
         shown = self._shown
         known = any(part.noise is not None for part in shown)
         head = ["record", "output", "samples", "fit (%)", "rms", "bias", *["noise"] * known]
@@ -128,13 +128,13 @@ class Residuals:
         """Figure of a record: correlations with their bounds, and spectra, a row an output.
 
         Args:
-            record: its name. Default: that with the least fit.
+            record: its name. Default: the record with the worst fit.
 
         Example:
             >>> figure = lfrtorch.analysis.residuals(bla, record).plot()
             >>> figure.savefig("residuals.png")
         """
-        from lfrtorch.analysis.residual_plots import residual_figure  # matplotlib takes its time
+        from lfrtorch.analysis.residual_plots import residual_figure  # importing it takes time
 
         return residual_figure(self.of(self.worst if record is None else record))
 
@@ -143,12 +143,12 @@ class Residuals:
 def residuals(
     model: Model | LinearModel, records: Record | Sequence[Record], *, lags: int | None = None
 ) -> Residuals:
-    """Residual analysis of simulations: fit, whiteness, what the errors still have of the inputs.
+    """Residual analysis of simulations: fit, whiteness, dependence of the errors on the inputs.
 
-    Each output of each record has its own tests, so that records of several levels tell at which
-    level a model fails. Samples that a record skips are left out. Correlations with inputs are
-    those of signals made white, as slow ones correlate by chance.
-    Records that the model was not fitted to tell most.
+    Each output of each record has its own tests: records of several levels show at which level a
+    model fails. Samples that a record skips are left out. Correlations with inputs are computed
+    from whitened signals, as slow signals correlate by chance. Records that the model was not
+    fitted to say most.
 
     Args:
         model: nonlinear or linear.
@@ -156,8 +156,8 @@ def residuals(
         lags: lags of the correlations. Default: 25, fewer in less than 1000 samples.
 
     Raises:
-        ValueError: a record of other channels or another rate than the model's, or of less than 20
-            scored samples.
+        ValueError: a record of other channels or another rate than the model's, or with fewer than
+            20 scored samples.
 
     References:
         Ljung, "System Identification: Theory for the User", 2nd ed., 1999, section 16.6.
@@ -190,7 +190,7 @@ def of_simulation(
             f"record '{record.name}' has {len(y)} scored samples; residuals need {SHORTEST} at "
             "least: give a longer record, or skip less."
         )
-    errors = record.errors(y_hat)  # 0 if y is not valid, which correlates with nothing
+    errors = record.errors(y_hat)  # 0 where y is not valid: such errors correlate with nothing
     K = lags_for(len(y), lags)
     linear = [whitened(near_one(channel)) for channel in u.T]
     squares = [whitened(near_one(channel) ** 2) for channel in (u - u.mean(axis=0)).T]
@@ -235,7 +235,7 @@ def of_simulation(
 
 
 def probability(p: float) -> str:
-    """A probability in two digits, or that it is below the least one printed."""
+    """A probability in two digits, or that it is below the smallest printed one."""
     return number(p, 2) if p >= _LEAST else f"< {_LEAST:.4f}"
 
 

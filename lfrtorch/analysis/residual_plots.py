@@ -15,9 +15,9 @@ from lfrtorch.analysis.output_residuals import OutputResiduals
 
 
 def residual_figure(parts: Sequence[OutputResiduals]) -> Figure:
-    """Correlations and spectra of the outputs of one record, the first four, a row each.
+    """Correlations and spectra of the first four outputs of one record, a row each.
 
-    Grey is where the correlations of 99 % of the lags are if nothing is left.
+    The grey bands hold 99 % of the correlations of errors that depend on nothing.
     """
     parts = parts[:4]
     figure = Figure(figsize=(11.0, 2.8 * len(parts) + 0.6), layout="constrained")
@@ -45,7 +45,7 @@ def residual_figure(parts: Sequence[OutputResiduals]) -> Figure:
 
 
 def _correlations(ax: Axes, found: Sequence[Correlation], labels: Sequence[str]) -> None:
-    """Correlations against lag, each a colour, and the widest of their bounds at each lag."""
+    """Draw correlations against lag, each in its colour, and the widest bound at each lag."""
     lags, bounds = found[0].lags, np.max([c.bounds for c in found], axis=0)
     ax.fill_between(lags, -bounds, bounds, color="0.88", lw=0, zorder=0)
     ax.axhline(0.0, color="0.6", lw=0.6, zorder=1)

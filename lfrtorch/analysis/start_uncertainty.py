@@ -1,4 +1,4 @@
-"""Part of the errors of a simulation by an uncertain start state.
+"""Part of a simulation's errors that is due to an uncertain start state.
 
 The start state is fitted to the first N samples of a record, with the covariance P of the states
 over the training data as a prior. Let S be the free responses of those outputs to the states
@@ -7,9 +7,9 @@ G = (SᵀS + σ² I)⁻¹ Sᵀ, and errs by
 
     cov(a - a₀) = (I - G S) (I - G S)ᵀ + G R Gᵀ,
 
-where R is the autocovariance of e. A model's errors are as slow as its system: taken for white,
-they would seem to tell a tenth of what they do not. R comes from the scored samples themselves, and
-this error goes on through the free responses there.
+where R is the autocovariance of e. A model's errors are as slow as its system; if they were taken
+for white, the error of the start state would seem ten times smaller. R is estimated from the scored
+samples, and the free responses carry the error of the start state on to these.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from lfrtorch.engine.operating_point import double
 from lfrtorch.model.model import Model
 
 LONGEST = 1 << 13
-"""Samples at the beginning of a record whose free responses are computed."""
+"""Number of samples at the beginning of a record whose free responses are computed."""
 
 
 @torch.no_grad()
 def start_error(model: Model, record: Record, y_hat: Float[Array, "T ny"]) -> float | None:
-    """RMS error that the uncertainty of the start state adds in scored samples.
+    """Return the RMS error that the uncertain start state adds in the scored samples.
 
     In physical units, of outputs of several units normalised. None if no start state is estimated
     from skipped samples, or from too many.

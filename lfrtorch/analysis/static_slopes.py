@@ -1,4 +1,4 @@
-"""Where a model has values but no derivatives, so that there is neither a step nor an error."""
+"""Points where a model has values but no derivatives: no step and no standard error there."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lfrtorch.model.model import Model
 
 @torch.no_grad()
 def infinite_slope(model: Model, records: Sequence[Record]) -> str:
-    """The first slope of the static map that is not finite along the records; "" if all are."""
+    """Name the first slope of the static map along the records that is not finite; "" if none."""
     cell = model.lfr.cell
     static, phi = cell.map, cell.weights().phi
     for record in records:

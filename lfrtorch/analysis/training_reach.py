@@ -15,14 +15,14 @@ from lfrtorch.model.data_reach import FARTHEST, Cloud
 class TrainingReach:
     """Range of the training data in the static map's input z, and in the uncertainty of y.
 
-    Two distances count, whichever is larger, each relative to the one of 99 % of the training
-    samples: of z from the middle of its cloud, in standard deviations of the cloud, and the
-    standard deviation of the simulated output, which tells of dynamics, too.
+    The larger of two distances counts, each relative to its value within which 99 % of the training
+    samples are. The first is that of z from the middle of its cloud, in standard deviations of the
+    cloud. The second is the standard deviation of the simulated output, which covers dynamics, too.
     """
 
     z: Cloud
     of_y: float
-    both: float  # of 99 %: the larger of the two
+    both: float  # 99 % quantile of the larger of the two distances
 
     @classmethod
     def of(cls, z: Float[Array, "S nz"], variance: Float[Array, "S ny"]) -> TrainingReach:
@@ -33,5 +33,5 @@ class TrainingReach:
         return cls(found.z, of_y, both)
 
     def surprises(self, z: Float[Array, "T nz"], variance: Float[Array, "T ny"]) -> Array:
-        """Surprise of each sample: 1 is as far as 99 % of the training samples go."""
+        """Surprise of each sample: 99 % of the training samples are within 1."""
         return np.maximum(self.z.surprise(z), np.sqrt(variance.sum(axis=1)) / self.of_y) / self.both

@@ -18,10 +18,10 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.operating_point import double, equilibrium, linearised_at, resting_near
 from lfrtorch.model.model import Model
 
-_REST = 1e3  # weight of x = f(x, u) beside the outputs, before the state is put to rest exactly
+_REST = 1e3  # weight of x = f(x, u) beside the outputs in a first solution; Newton then solves it
 
 _UNIT = 1e-6
-"""Weight of the distance to the inputs' offsets, which chooses among several answers."""
+"""Weight of the distance to the inputs' offsets, which selects one of several solutions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +31,8 @@ class Trim:
     Args:
         x: state in the model's coordinates.
         u, y: input and output, physical units.
-        residual: y less the output that was asked for, 0 where none was.
-        outside: parts that the data of the fit did not reach, in words; empty if they reached all.
+        residual: y minus the wanted output; 0 for outputs that were free.
+        outside: what the data of the fit did not reach of this point, in words; empty if all of it.
 
     Example:
         >>> found = lfrtorch.analysis.trim(model, u=0.5)
@@ -55,23 +55,23 @@ def trim(
     u: ArrayLike | None = None,
     bounds: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> Trim:
-    """The state and the input at which a model rests with given outputs and inputs.
+    """Find the state and the input at which a model rests with given outputs and inputs.
 
-    By least squares: if no rest has these outputs, it is the one whose outputs, over their scales,
-    are nearest to them, and ``residual`` says how far they are. If several inputs do as well,
-    it is the one nearest to the offsets of the data. Integrators are at rest, too.
+    The solution is by least squares: if no rest has the given outputs, it is the rest whose
+    outputs, over their scales, are nearest to them, and ``residual`` holds the differences. If
+    several inputs do as well, it is the one nearest to the data's offsets. Integrators rest, too.
 
     Args:
-        y: outputs, physical units; NaN for those that are free. Default: all are.
+        y: outputs, physical units; NaN for free outputs. Default: all are free.
         u: inputs, likewise. Default: all are free.
-        bounds: the least and the largest input, physical units; infinite or NaN for none.
+        bounds: the smallest and the largest input, physical units; infinite or NaN for no bound.
 
     Shape:
         y: (ny,) or a number for one output, u and both bounds: (nu,) or a number.
 
     Raises:
-        ValueError: wrong shapes, a least input above the largest one, a given input outside of
-            them, or no rest that was found.
+        ValueError: wrong shapes, a lower bound above the upper one, a given input outside of the
+            bounds, or no rest that was found.
 
     Example:
         >>> found = lfrtorch.analysis.trim(model, y=0.2)
@@ -120,8 +120,8 @@ def trim(
     x = resting_near(cell, v, torch.as_tensor(found[:nx]))
     if x is None:
         raise InputError(
-            "no rest was found with these inputs and outputs; give values nearer to those of the "
-            "data, or leave more of them free (NaN)."
+            "no rest was found with these inputs and outputs; give values nearer to the data, or "
+            "leave more of them free (NaN)."
         )
     return _trim(model, cell, x, v, wanted, asked)
 
@@ -141,7 +141,7 @@ def _numbers(name: str, given: ArrayLike, size: int) -> Array:
     found = np.atleast_1d(reals(name, given))
     if found.shape != (size,) or np.isinf(found).any():
         raise InputError(
-            f"{name} is {given!r}; give {size} number(s), with NaN for those that are free."
+            f"{name} is {given!r}; give {size} number(s), NaN for those that are free."
         )
     return found
 
@@ -149,14 +149,14 @@ def _numbers(name: str, given: ArrayLike, size: int) -> Array:
 def _bounds(
     given: tuple[ArrayLike, ArrayLike] | None, offset: Array, scale: Array
 ) -> tuple[Array, Array]:
-    """The least and the largest input, normalised."""
+    """Return the smallest and the largest input, normalised."""
     found = []
     for side, none in zip((None, None) if given is None else given, (-np.inf, np.inf), strict=True):
         value = reals("bounds", none if side is None else side)
         if value.shape not in ((), (1,), offset.shape):
-            raise InputError(f"bounds is {given!r}; give two of {len(offset)} number(s).")
+            raise InputError(f"bounds is {given!r}; give two bounds of {len(offset)} number(s).")
         value = np.broadcast_to(value, offset.shape)
         found.append((np.where(np.isnan(value), none, value) - offset) / scale)
     if not (found[0] < found[1]).all():
-        raise InputError(f"bounds is {given!r}; give the least input, then the largest.")
+        raise InputError(f"bounds is {given!r}; give the smallest input, then the largest.")
     return found[0], found[1]

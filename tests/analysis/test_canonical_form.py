@@ -154,7 +154,7 @@ def test_what_has_no_nonlinearity_is_refused():
     model = strong()
     with torch.no_grad():
         model.lfr.cell.static.get_parameter("Ww").zero_()  # type: ignore[union-attr]
-    with pytest.raises(lfrtorch.InputError, match="nothing of it is nonlinear"):
+    with pytest.raises(lfrtorch.InputError, match="it has no nonlinear part"):
         canonical(model, measure(model, 50))
 
 

@@ -182,7 +182,7 @@ def test_each_record_and_output_of_either_model_has_its_row():
     assert len(figure.axes) == 8
     linear = lfrtorch.estimate_bla(loud, nx=2)
     assert lfrtorch.analysis.residuals(linear, loud).of("loud")[0].fit < 100
-    with pytest.raises(lfrtorch.InputError, match="give of loud"):
+    with pytest.raises(lfrtorch.InputError, match="give loud"):
         lfrtorch.analysis.residuals(linear, loud).of("quiet")
 
 

@@ -103,8 +103,8 @@ def test_a_linearisation_is_saved_with_its_state(model: Model, tmp_path):
     [
         ({"y": [1.0]}, "y is .*; give 2 number"),
         ({"u": [1.0, np.inf]}, "u is .*; give 2 number"),
-        ({"bounds": (3.0, 2.0)}, "give the least input"),
-        ({"bounds": ([1.0, 2.0, 3.0], 5.0)}, "give two of 2"),
+        ({"bounds": (3.0, 2.0)}, "give the smallest input"),
+        ({"bounds": ([1.0, 2.0, 3.0], 5.0)}, "give two bounds of 2"),
         ({"u": [9.0, NAN], "bounds": (0.0, 1.0)}, "outside of the bounds"),
     ],
 )
