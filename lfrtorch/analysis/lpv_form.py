@@ -1,10 +1,9 @@
 """The exact LPV form: the model as one that is linear in x and u, with varying parameters.
 
-Let ζ = z - z0. The static map is f(z) = f(z0) + Δ(ζ) ζ with Δ = ∫ f'(z0 + t ζ) dt, t from 0 to 1.
-A network has Δ = Ww diag(s) Wz, where s = (σ(v0 + d) - σ(v0)) / d are the mean slopes of its
-neurons between v0 and v0 + d, d = Wz ζ. A mean slope lies between the smallest and the largest
-slope, so the
-parameters of the form are bounded.
+Let ζ = z - z0. The static map is f(z) = f(z0) + Δ(ζ) ζ with Δ = ∫ f'(z0 + t ζ) dt, t from 0 to 1. A
+network has Δ = Ww diag(s) Wz, where s = (σ(v0 + d) - σ(v0)) / d are the mean slopes of its neurons
+between v0 and v0 + d, d = Wz ζ. A mean slope lies between the smallest and the largest slope, so
+the parameters of the form are bounded.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ class LPV:
         x+ = x_next0 + A(p) (x - x0) + B(p) (u - u0)
         y  = y0      + C(p) (x - x0) + D(p) (u - u0)
 
-    A(p) = A[0] + p_1 A[1] + p_2 A[2] + .., and likewise B, C and D. With p = scheduling(x, u) the
+    A(p) = A[0] + p_1 A[1] + p_2 A[2] + .., and likewise B, C and D. For p = scheduling(x, u) the
     form is the model itself, not an approximation. At rest x_next0 = x0.
 
     Args:

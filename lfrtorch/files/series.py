@@ -4,7 +4,8 @@ Channels that are read together are put on one clock. If all of them have the sa
 these are the clock. Otherwise the clock is even, at their mean rate, over the time in which all of
 them run, and straight lines join their samples. If two neighbouring samples are several steps
 apart, there is a hole without values (NaN). A channel that is logged on change is held between its
-samples and after the last one. Channels of
+samples and after the last one. Channels of different rates are refused together, unless the path
+ends in a rate for all: ``drive.mf4#50Hz``.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ more lines, tells how soon the system forgets:
 
     V + a V / jω = (b + jω c) U,
 
-its time constant is 1 / a.
+where 1 / a is its time constant.
 
 An output that is the integral of another output, as a position is of a speed, shows this without a
 spectrum: its change over a stretch is a multiple of the other output's integral. A mass on a spring
