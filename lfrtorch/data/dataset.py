@@ -12,7 +12,7 @@ from lfrtorch.data.records import Record, signals
 from lfrtorch.data.score_window import with_window
 
 LISTED = 3
-"""Most records of a use that a printed dataset lists."""
+"""Largest number of records of a use that a printed dataset lists."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class Published:
 
     Args:
         label: column head, for example ``"NL-LFR (paper)"``.
-        scores: RMSE in the output's unit, by the name of the test record; one of several outputs
-            has the names of both, as ``"multisine acc1"``.
+        scores: RMSE in the output's unit, by the name of the test record; for several outputs, by
+            the names of record and output, as ``"multisine acc1"``.
         reference: source of the numbers.
         sizes: (nz, nw) if the number belongs to one model size only.
         unit: unit of the output with the prefix for tables, ``"µm"`` for example. Default:
@@ -45,11 +45,11 @@ class Undecided(NamedTuple):
     """A training record with an estimated start that may begin at rest.
 
     Args:
-        record: the whole of it.
-        seen: its samples that may tell it, those before its test part.
-        skip: samples of the training part that do not count if it begins at rest.
-        places: numbers of its parts among the records of a use, by ``"train"``, ``"validation"``
-            and ``"test"``.
+        record: the whole record.
+        seen: number of its samples before its test part, on which the start may be decided.
+        skip: samples of the training part that are skipped if it begins at rest.
+        places: numbers of its parts among the records of each use, by ``"train"``,
+            ``"validation"`` and ``"test"``.
     """
 
     record: Record
@@ -66,24 +66,24 @@ class Dataset:
         name: the benchmark's name, or the file's stem.
         train: records that are fitted; here and below a single record needs no list.
         validation: records that choose among iterates and starts; never fitted.
-        selection: more records that choose among starts, and not among the iterates of one: at
-            other amplitudes, for example.
-        tests: records touched by evaluation alone.
+        selection: further records that choose among starts, but not among the iterates of a start:
+            at other amplitudes, for example.
+        tests: records that only an evaluation uses.
         noise_rms: rms of the measurement noise added to simulated estimation data, output unit;
             ``None`` for measured data.
         published: results of others on the same tests.
-        linear: training records from which the linear model of a test is estimated, by the names
-            of test or group and of records. Other tests have the linear model of all records.
+        linear: names of the training records from which the linear model of a test is estimated, by
+            the name of the test or group. Other tests have the linear model of all records.
         notes: remarks on the data for readers of the scores, a sentence each.
         seed: seed of simulated data.
-        groups: names of test or validation records that make one score, by its name: the mean of
-            the RMSE of each output of each record.
+        groups: names of test or validation records that form one score, by the name of the score:
+            the mean of the RMSE over the outputs and records.
         ahead: scores of predictions from measured starts, by name: functions of predicted and
             measured outputs, (n, horizon, ny) each, that return errors (n, horizon). A score is
             the sum over the horizon of their means.
         leaderboard: test records as nonlinearbenchmark.org scores them: cut by the package
             nonlinear_benchmarks, with the start state fitted to the samples left unscored.
-        undecided: training records of which an identification chooses how they begin.
+        undecided: training records whose start an identification decides.
 
     Raises:
         ValueError: anything but records.

@@ -85,15 +85,15 @@ def multisine(
         fs: sampling frequency in Hz.
         band: lowest and highest frequency in Hz. Default: all lines between 0 and fs / 2.
         lines: numbers (F,) of the DFT lines to choose from, instead of a band.
-        grid: excited lines among these: ``"full"`` all; ``"odd"`` the odd ones; ``"random_odd"``
-            the odd ones except one of every ``group`` in a row, drawn at random. The lines that
-            are not excited show nonlinear distortion and noise.
+        grid: the excited ones of these lines: ``"full"``: all; ``"odd"``: the odd ones;
+            ``"random_odd"``: the odd ones except one of every ``group`` in a row, drawn at random.
+            The lines that are not excited show nonlinear distortion and noise.
         group: number of odd lines in a group.
         rms: root mean square of each input, in every experiment.
-        amplitude: relative amplitudes of the lines 0 to N / 2, of which the excited ones count.
+        amplitude: relative amplitudes of the lines 0 to N / 2; only excited lines matter.
             Default: all equal.
-        nu: inputs.
-        realisations: number of independent ones, nu experiments each.
+        nu: number of inputs.
+        realisations: number of independent realisations, nu experiments each.
         seed: seed of phases and lines, or a generator to draw them from.
 
     Shape:

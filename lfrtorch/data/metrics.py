@@ -39,7 +39,7 @@ def rmse(record: Record, y_hat: Array) -> float:
 
 
 def rmse_by_output(record: Record, y_hat: Array) -> Array:
-    """Return the RMSE of each output, (ny,); NaN for one without a scored sample."""
+    """Return the RMSE of each output, (ny,); NaN for an output without a scored sample."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         squares = np.square(record.errors(y_hat)).sum(axis=0)
         return np.sqrt(squares / record.scored.sum(axis=0))
@@ -49,7 +49,7 @@ def rmse_by_output(record: Record, y_hat: Array) -> Array:
 def nrmse(record: Record, y_hat: Array) -> float:
     """RMSE over the standard deviation of the measured output, both over the scored samples.
 
-    Each of several outputs is divided by its own deviation. The result is the root mean square over
+    Each output is divided by its own standard deviation. The result is the root mean square over
     the outputs that are not constant; NaN if there are none.
 
     Example:
@@ -57,7 +57,7 @@ def nrmse(record: Record, y_hat: Array) -> float:
         True
     """
     outputs = [y[there] for y, there in zip(record.y.T, record.scored.T, strict=True)]
-    # Deviation from the first sample: exactly 0 for a constant, whose mean has rounding errors.
+    # Subtract the first sample: std is exactly 0 for a constant, whose mean has rounding errors.
     deviations = np.array([np.std(y - y[0]) if len(y) else 0.0 for y in outputs])
     rmse(record, y_hat)  # refuses other shapes
     moved = deviations > 0
@@ -74,7 +74,7 @@ class BlockScores:
 
     def __init__(self, ny: int, skip: int = 0) -> None:
         self.samples = np.zeros(ny, dtype=np.int64)
-        """Samples that count."""
+        """Number of samples that count, by output."""
         self._skip = skip
         self._mean, self._spread, self._errors = np.zeros((3, ny))
 
@@ -88,7 +88,7 @@ class BlockScores:
         there = np.isfinite(y)
         added = there.sum(axis=0)
         first = (self.samples == 0) & (added > 0)
-        # Samples of a constant then have no deviation from the mean so far.
+        # Then the samples of a constant do not deviate from the mean so far.
         self._mean[first] = y[there.argmax(axis=0), np.arange(len(first))][first]
         whole = np.maximum(self.samples + added, 1)
         y = np.where(there, y, self._mean)

@@ -1,19 +1,19 @@
 """Comparison of models by their errors on the same samples, in pairs.
 
 The one-standard-error rule takes the smallest model whose error is within one standard error of the
-best. All models are scored on the same samples and share their noise, so that two models differ by
-the difference of their squared errors alone. The standard error is that of its mean. The difference
-is correlated in time, so its means over ten blocks are treated as independent. They are, if a block
-is long compared with the system's memory. The usual form, with the standard error of the best
-model's own error, misses differences if noise is large: a mean square larger by 1.4 % is three
-standard errors of the difference over 2600 samples, and half a standard error of its own. If two
-models are equally good, the smaller one is taken in 83 % of cases.
+best. All models are scored on the same samples and share their noise, so that only the difference
+of their squared errors matters. The standard error is that of the mean of this difference. The
+difference is correlated in time, but its means over ten blocks count as independent; they are, if a
+block is long compared with the system's memory. The usual rule, with the standard error of the best
+model's own error, misses differences if noise is large. Over 2600 samples, a mean square larger by
+1.4 % was three standard errors of the difference, but half a standard error of the error itself. If
+two models are equally good, the smaller one is taken in 83 % of cases.
 
 Long records resolve differences that are not worth a parameter: on the Silverbox 25 neurons are
-better than 5 by 0.6 %, or two standard errors. So a model within 1 % of the best counts as equally
-good. If a few resonances or impacts make up most of the error, one standard error can be a fifth of
-it, and the smallest model within it leaves out just these. So no model more than 5 % above the best
-counts as equally good by default.
+better than 5 by 0.6 %, which is two standard errors. So a model within 1 % of the best counts as
+equally good. If a few resonances or impacts make up most of the error, one standard error can be a
+fifth of it, and the smallest model within it leaves out just these. So no model more than 5 % above
+the best counts as equally good by default.
 
 References:
     Hastie, Tibshirani and Friedman, "The Elements of Statistical Learning", 2nd ed., 2009, section
@@ -37,12 +37,12 @@ MARGIN = 0.01
 """Relative excess of the rms error up to which a model counts as equally good as the best."""
 
 BLOCKS = 10
-"""Least number of blocks of time, over all records."""
+"""Smallest number of blocks of time, over all records."""
 
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """Judge of models by their errors: orders, sizes, starts, an NL-LFR and its linear model.
+    """Comparison of models by their errors: orders, sizes, starts, an NL-LFR and its linear model.
 
     Args:
         squares: sums of squared errors of each model in each block of time; infinite if it
@@ -71,8 +71,8 @@ class Judge:
     def as_good(self, *, errors: float = 1.0, most: float = 1.05) -> Booleans:
         """Mask of the models that are as good as the best.
 
-        Their mean squares are within ``errors`` standard errors of the least and their rms errors
-        at most ``most`` times as large, or within ``MARGIN``.
+        Either the rms error is within ``MARGIN`` of the smallest. Or the mean square is within
+        ``errors`` standard errors of the smallest, and the rms error at most ``most`` times it.
         """
         means = self.squares.sum(axis=1)
         near = self.above() <= errors
@@ -84,7 +84,7 @@ class Judge:
         return int(np.argmax(self.as_good()))
 
     def above(self) -> Array:
-        """Excess of the mean squares of models over the least, in standard errors."""
+        """Excess of the mean squares of models over the smallest one, in standard errors."""
         best = int(np.argmin(self.squares.sum(axis=1)))
         with np.errstate(invalid="ignore", divide="ignore"):
             difference, error = blocked_mean(self.squares - self.squares[best], self.counts)
@@ -102,10 +102,10 @@ class Judge:
         return ratio, float(spread) / (2.0 * ratio) if ratio > 0 else 0.0
 
     def middle(self, most: float, least_error: float) -> tuple[float, float]:
-        """Mean log ratio of the second model's errors over the blocks, and its errors from 0.
+        """Mean log ratio of the second model's errors over the blocks; also in standard errors.
 
-        A ratio beyond ``most`` counts as ``most``, so that a block in which one diverges has little
-        weight.
+        A ratio beyond ``most`` counts as ``most``, so that a block in which a model diverges has
+        little weight.
         """
         base, squares = self.squares
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

@@ -10,17 +10,17 @@ from lfrtorch._support.types import Array
 
 _ALIKE = 0.02  # largest D(p) that counts as noise; parts of narrow-band noise reach 0.05 at times
 
-# Largest D(k p) / (k D(p)): it grows as k² with a p that is a little wrong, at most as k with the
-# drift of an amplifier, and not at all with noise.
+# Largest D(k p) / (k D(p)): it grows as k² for a p that is slightly wrong, at most as k for the
+# drift of an amplifier, and not at all for noise.
 _GROWTH = 1.5
 _BEGINNING = 1 / 3  # share of the record in which an input may differ from what it repeats later
 _NEAR = 2.0  # the shortest period counts as good if its D is within this factor of the best
-_EXACT = 1e-9  # difference of what repeats exactly, far above rounding
+_EXACT = 1e-9  # D of a signal that repeats exactly is below this, which is far above rounding
 _FASTER = 0.75  # largest shift that is tried, relative to the record
 
-_SETTLED = 2.0  # mean square difference of settled periods, relative to noise, at most
-_SMALL = 1e-5  # rms difference over that of the output which is no transient, noise or not
-_TAIL = 4  # last part of the difference of two periods that is taken for noise
+_SETTLED = 2.0  # largest mean square difference of settled periods, relative to noise
+_SMALL = 1e-5  # an rms difference below this part of the output's is never a transient
+_TAIL = 4  # the last 1 / TAIL of the difference of two periods is taken for noise
 
 
 def find_period(u: Array) -> int | None:
@@ -73,13 +73,13 @@ def _shortest(D: Array, T: int) -> int | None:
 
 
 def _stays_small(D: Array) -> bool:
-    """Tell if D of 1, 2, ... periods is that of noise, a drift or a transient."""
+    """Tell if D at 1, 2, ... periods is due to noise, a drift or a transient."""
     most = np.maximum(_GROWTH * np.arange(1, len(D) + 1), 3.0) * D[0] + _EXACT
     return bool((np.minimum(most, _ALIKE) > D).all())
 
 
 def _differences(u: Array) -> Array:
-    """Differences D(p) of the signal that repeats worst, p = 0, 1, ... to 3/4 of the record."""
+    """Differences D(p), p = 0, 1, ... to 3/4 of the record, for the signal that repeats worst."""
     T = len(u)
     last = max(int(_FASTER * T), T // 2)
     worst = np.zeros(last + 1)
@@ -99,16 +99,16 @@ def _differences(u: Array) -> Array:
 def find_transient(y: Array, period: int) -> int:
     """Number of samples in the first whole periods in which the outputs have not settled.
 
-    These are the periods, from the first on, that differ from the next one by more than the last
-    two from each other. If there are only two periods, the end of their difference is taken for
-    noise. The last whole period never counts. Shape of y: (T, ny) or (T,).
+    These are the periods, from the first on, that differ from the next period by more than the last
+    two periods differ from each other. If there are only two periods, the end of their difference
+    is taken for noise. The last whole period never counts. Shape of y: (T, ny) or (T,).
     """
     y = y.reshape(len(y), -1)
     count = len(y) // period
     if count < 2:
         return 0
     periods = y[: count * period].reshape(count, period, -1)
-    # Difference from the next period, not from the last: a drift is no transient.
+    # Difference from the next period, not from the last: a drift is not a transient.
     difference = np.diff(periods, axis=0) ** 2  # (count - 1, period, ny)
     size = difference.mean(axis=1)
     noise = size[-1] if count > 2 else difference[0, -(period // _TAIL) - 1 :].mean(axis=0)

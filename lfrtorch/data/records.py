@@ -22,7 +22,7 @@ from lfrtorch._support.types import Array, Booleans
 Start = Literal["zero", "given", "estimated", "periodic", "measured"]
 
 _SMALLEST = 1e-100
-"""Least level of a signal, and sampling frequency, whose square does not vanish."""
+"""Smallest level of a signal, and sampling frequency, whose square does not vanish."""
 
 _LARGEST = 1e100
 """Largest level of a signal, and sampling frequency, whose square does not overflow."""
@@ -49,7 +49,7 @@ def described_channels(entries: Any) -> tuple[Channel, ...]:
     """Describe channels for a JSON file."""
     found = tuple(Channel(**entry) for entry in entries)
     if not all(isinstance(text, str) for channel in found for text in channel):
-        raise TypeError("a name or a unit of a channel is no text")
+        raise TypeError("a name or a unit of a channel is not text")
     return found
 
 
@@ -60,7 +60,7 @@ def common_unit(channels: Sequence[Channel]) -> str:
 
 
 def of_one_unit(channels: Sequence[Channel]) -> bool:
-    """Tell if all channels have one unit; errors in different units only add up as relative ones.
+    """Tell if all channels have the same unit; errors of different units add up relatively only.
 
     A channel without a unit differs from a channel with one.
     """
@@ -88,16 +88,16 @@ class Record:
             without ``skip``: line f is that of ``numpy.fft.rfft``. 1 for all lines is plain least
             squares; 1 / noise variance is maximum likelihood (Pintelon and Schoukens, 2012,
             chapter 9).
-        limits: least and greatest output that the sensors show, each a number for all outputs or
+        limits: smallest and largest output that the sensors show, each a number for all outputs or
             one for each, or ``None``. A sample at a limit means that the output is there or beyond:
-            a fit counts the error on the inner side alone, and an estimated start leaves the sample
-            out. A simulation of the record is clipped there.
+            a fit counts errors on the inner side alone, and an estimated start leaves the sample
+            out. A simulation of the record is clipped to the limits.
         source: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``, the origin.
-        inputs, outputs: channel names and units, one a column of ``u`` and ``y``.
+        inputs, outputs: channel names and units, one for each column of ``u`` and ``y``.
         period: samples of one period of the input, if it repeats; a ``"periodic"`` record holds
             a whole number of them. Default: one.
-        reference: noise-free signal of each input, known to the experimenter: the setpoint where a
-            controller makes the input, the generator's signal where the input is measured with
+        reference: noise-free signal of each input, known to the experimenter: the setpoint if a
+            controller makes the input, the generator's signal if the input is measured with
             noise. Best linear approximations are estimated from it, see
             :func:`lfrtorch.estimate_frf`.
         valid: mask of the output samples that are measurements: False for outliers and dropouts.
@@ -182,20 +182,20 @@ class Record:
         fs: float | None = None,
         **options: Any,
     ) -> Record:
-        """A record of columns of a pandas data frame; outputs without a value are not valid.
+        """Make a record from columns of a pandas data frame; outputs without a value are not valid.
 
         Args:
             frame: rows are samples.
-            inputs, outputs: one or several columns by name; a unit may stand behind it, "force (N)"
-                is also called "force".
+            inputs, outputs: one or several columns by name; "force (N)", with its unit, is also
+                called "force".
             fs: sampling frequency in Hz. Default: from an index of date-times, time differences or
                 seconds, evenly spaced. If the index is uneven, the signals are interpolated to even
                 times of ``fs``; where a few rows are missing, outputs are not valid.
             options: other arguments of a record.
 
         Raises:
-            ValueError: a column that is not there or has no numbers, infinite values, inputs
-                without a value, an index that is no even time, or several runs.
+            ValueError: a column that is missing or has no numbers, infinite values, inputs without
+                a value, an index that is not an even time, or several runs.
 
         Example:
             >>> import pandas as pd
@@ -254,8 +254,8 @@ class Record:
             )
         if self.start == "measured" and not self.valid[0].all():
             raise InputError(
-                f"record '{self.name}' has start 'measured', and its first output is not valid; "
-                "cut the record to where all outputs are, or give start='estimated'."
+                f"record '{self.name}' has start 'measured', but its first output is not valid; "
+                "cut the record to where all outputs are valid, or give start='estimated'."
             )
         if not self.scored.any():
             raise InputError(
@@ -453,7 +453,7 @@ class Record:
     ) -> Record:
         """Return a record of the same kind with other signals; ``others`` are other fields.
 
-        A call names every field that depends on the signals, so that none stays by mistake.
+        Every field that depends on the signals is an argument, so that none is kept by mistake.
         """
         return replace(
             self, u=u, y=y, reference=reference, valid=valid, limits=limits, start=start, skip=skip,
@@ -461,7 +461,7 @@ class Record:
         )  # fmt: skip
 
     def mean_period(self) -> Record:
-        """Return one period, the mean of all P of a record in steady state, with their weight.
+        """Return one period: the mean of all P periods of a record in steady state, with weight P.
 
         A fit of the simulation error gives the same model if the input has no noise, and is faster.
         Noise of the input keeps 1 / P of its power in the mean, and 1 / P of its bias in a model.
@@ -597,7 +597,7 @@ class NormalisedRecord:
     Args:
         u, y: normalised input (T, nu) and output (T, ny); a predictor's input has y as well.
         record: the record itself, with its start and weights.
-        limits: least and greatest output (2, ny), normalised.
+        limits: smallest and largest output (2, ny), normalised.
     """
 
     u: Array
@@ -628,12 +628,12 @@ class Scaler:
 
     @classmethod
     def of(cls, records: Sequence[Record], *, offset: bool = True) -> Scaler:
-        """Scaler from the means of the records, or 0 without ``offset``, and the rms about them."""
+        """Scaler from the means of the records (0 without ``offset``), and the rms about these."""
         us, ys = [r.u for r in records], [r.y for r in records]
 
         def centre(signals: list[Array]) -> Array:
             together = np.concatenate(signals)
-            first = together[0]  # the mean of a constant is that, without rounding errors
+            first = together[0]  # subtracted, so that the mean of a constant has no rounding errors
             return first + (together - first).mean(axis=0) if offset else np.zeros_like(first)
 
         u_offset, y_offset = centre(us), centre(ys)
@@ -696,7 +696,7 @@ def _side(
 
 
 def check_largest(what: str, largest: float) -> None:
-    """Refuse a signal whose largest square overflows or vanishes."""
+    """Refuse a signal whose largest value has a square that overflows or vanishes."""
     if largest > _LARGEST or 0 < largest < _SMALLEST:
         raise InputError(
             f"{what} goes up to {largest:g}; give it in a unit that brings it between "
@@ -705,7 +705,7 @@ def check_largest(what: str, largest: float) -> None:
 
 
 def check_rate(what: str, fs: float) -> None:
-    """Refuse a sampling frequency in Hz beyond the same limits."""
+    """Refuse a sampling frequency in Hz outside of the same limits."""
     number(what, fs, positive=True)
     if not _SMALLEST <= fs <= _LARGEST:
         raise InputError(f"{what} is {fs} Hz; give one between {_SMALLEST:g} and {_LARGEST:g} Hz.")

@@ -1,9 +1,9 @@
 """Default scored samples of a record: those that its start does not affect.
 
 A record from rest leaves out the samples in which its output settles. An estimated start state is
-fitted to the first 50 samples, or the first fifth of a shorter record, and the rest is scored, for
-all models alike. Published scores of measured records leave out 10 to 50 samples. The covariance of
-the states over the training data supplements so few outputs.
+fitted to the first 50 samples, or the first fifth of a shorter record, and the rest is scored. This
+holds for all models alike. Published scores of measured records leave out 10 to 50 samples. So few
+outputs are supplemented by the covariance of the states over the training data.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ WINDOW = 50
 """Samples to which an estimated start is fitted, and which a score leaves out."""
 
 PART = 5
-"""Least length of a record, relative to the window."""
+"""Smallest length of a record, relative to the window."""
 
 SHORTEST = 10
-"""Least scored samples of a part of a record."""
+"""Smallest number of scored samples of a part of a record."""
 
-# Part of a record from rest that is left out, and the longest transient that is: leaving out a
-# longer one costs more than it helps.
+# Part of a record from rest that is left out, and the longest transient that is left out, as a part
+# of the record: leaving out a longer one costs more than it helps.
 _WARM_UP, _LONGEST = 1 / 20, 1 / 3
 
 
