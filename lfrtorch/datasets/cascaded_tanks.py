@@ -6,9 +6,9 @@ The outflow is proportional to the root of the level. At large inputs the upper 
 partly into the lower one, and the sensor of the lower one saturates at 10 V (48 estimation
 samples): a limit of the records.
 
-The records do not begin at rest, and their start states are unknown; the benchmark says that they
-are the same. Older versions of the package nonlinear_benchmarks left 5 samples of the test
-unscored, version 1.0 leaves 50, and published figures may have either.
+The records do not begin at rest; their start states are unknown, but the same according to the
+benchmark. Older versions of the package nonlinear_benchmarks left 5 samples of the test unscored,
+version 1.0 leaves 50; published scores may have either.
 
 References:
     M. Schoukens, P. Mattson, T. Wigren, J.P. Noël (2016), "Cascaded tanks benchmark combining soft
@@ -47,8 +47,9 @@ def load(
     """Estimation record, whole or cut in time for training and validation, and the test record.
 
     Training estimates its start states with the parameters. A validation record is the estimation
-    record up to the last sample that validates: the samples before the first one, which it skips,
-    give its start state. The start state of the test is fitted to its first ``skip`` samples.
+    record up to the last validation sample; it skips the samples before the first validation
+    sample, to which its start state is fitted. The start state of the test is fitted to its first
+    ``skip`` samples.
 
     Args:
         validation: fraction of the estimation samples that validate. With 0 all of them train, so

@@ -10,7 +10,7 @@ The pulse counter does not see the sign of the speed: z is its absolute value, a
 pulley hangs on a spring, which gives a lightly damped mode.
 
 The archive is FULLTEXT01.zip, or CoupledElectricDrivesDataSetAndReferenceModels.zip in older
-versions of nonlinear_benchmarks; its PRBS measurements, DATAPRBS.MAT, are no part of the benchmark.
+versions of nonlinear_benchmarks. Its PRBS measurements, DATAPRBS.MAT, are not in the benchmark.
 
 References:
     T. Wigren, M. Schoukens (2017), "Coupled electric drives data set and reference models",

@@ -11,7 +11,7 @@ position controller (its reference qg and the times t are in the files, too, and
 
 The input vir is a voltage; the authors' scripts convert it to a force by the drive gain gtau (N/V)
 in the files, which does not change the scores of a model. The pulses of the test file (pulses_N)
-are no input in those scripts, nor here. The output is qm as stored, in metres.
+are not an input in those scripts, nor here. The output is qm as stored, in metres.
 
 References:
     A. Janot, M. Gautier, M. Brunot (2019), "Data set and reference models of EMPS", Workshop on
@@ -53,11 +53,11 @@ def load(
     which are not scored. Those of the validation record are the last ones of training.
 
     Args:
-        validation: last fraction of the estimation samples, which validates. With 0 all train, and
-            random starts are judged on them like the test: from a start state that is fitted to
-            the first samples alone.
+        validation: last fraction of the estimation samples, which validates. With 0 all samples
+            train, and random starts are judged on them as on the test: from a start state that is
+            fitted to the first samples alone.
         warm_up: first samples of the validation record, to which its start state is fitted; they
-            train, too. Default: as many as the test has.
+            train, too. Default: as many as for the test.
         download: download missing files.
         root: folder that holds ``EMPS/DATA_EMPS.mat`` and ``EMPS/DATA_EMPS_PULSES.mat``, or
             ``EMPS/EMPS.zip`` with both in it.

@@ -8,9 +8,9 @@ modes are lightly damped. Sampled at 400 Hz, at seven levels (of the multisines 
 periods of 8192 samples, the first of them a transient, and a swept sine from rest. Levels 1, 3, 5
 and 7 are for estimation; 2, 4 and 6, whose files end in ``_Validation``, are the tests.
 
-- The force carries measurement noise, and the structure acts back on the shaker and so on the
-  force: it is not the generator's signal. Noise at the input biases a least squares fit; the mean
-  over periods lessens it.
+- The force is not the generator's signal: it carries measurement noise, and the structure acts back
+  on the shaker and so on the force. Noise at the input biases a least squares fit; the mean over
+  periods reduces it.
 - The published scores are of the first acceleration alone. A score here pools the three outputs;
   ``rmse_by_output`` has each.
 - The window of 50 samples, 0.125 s, is too short a warm-up for modes that ring for seconds. The
@@ -66,8 +66,8 @@ def load(
 ) -> Dataset:
     """Measurements for training, whole records of others for validation, and the six tests.
 
-    A multisine that trains is the mean of the last 8 of its 9 periods, in steady state: noise, that
-    of the force included, is lower by √8, and its squared errors have the weight 8. Swept sines,
+    A training multisine is the mean of the last 8 of its 9 periods, in steady state. Its noise,
+    also in the force, is lower by √8, and its squared errors have the weight 8. Swept sines,
     validation and the tests are whole records from rest, their first 50 samples unscored.
 
     The tests are ``"multisine_2"``, ``"multisine_4"``, ``"multisine_6"``, ``"sweep_2"``,

@@ -54,10 +54,10 @@ def load(
     """Realisations of several levels for training, others for validation, and the tests.
 
     A training record is the mean of the two periods of a realisation, with the weight 2. Each
-    period of a validation or test realisation is a record. Those of a level make one score,
-    ``"level_100"``, ``"level_200"`` and ``"level_300"``, and ``"validation_100"`` and so on: the
-    mean over outputs and records of the RMSE. A level's linear model is that of its training
-    records.
+    period of a validation or test realisation is a record. The records of a level form one score,
+    the mean of the RMSE over outputs and records: ``"level_100"``, ``"level_200"`` and
+    ``"level_300"``, and ``"validation_100"`` and so on. The linear model of a level is estimated
+    from its training records.
 
     Without test arrays in the file there are no tests, and a note says so.
 

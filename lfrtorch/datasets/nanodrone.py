@@ -3,20 +3,20 @@
 Inputs are the speeds of the four motors (rad/s), outputs position (m) and velocity (m/s) in the
 frame of the room, roll, pitch and yaw (rad) and the body's rates (rad/s), at 100 Hz. A row holds
 inputs and outputs of the same instant; the inputs of a row act on the outputs of the next one. The
-first inputs of a flight are missing: the second ones take their place. Angles are unwrapped.
+first inputs of a flight are missing and replaced by the second ones. Angles are unwrapped.
 
 The outputs 1 to 50 samples ahead of each sample are predicted from the inputs. A score is the sum
 over these 50 samples of the mean error: Euclidean for position, velocity and rates, the angle
 between the two attitudes for the attitude.
 
-Four flights each of three kinds, squares, chirps and random ones, are for estimation, three of a
+Four flights each of three kinds (squares, chirps and random flights) are for estimation, three of a
 fourth kind, melon, for the test. The files are those of the release,
 ``train/chirp_20251017_run1.csv`` and so on, with quaternions for the attitude, or
 ``train_chirp_run1.npz`` with arrays u (N, 4) and y (N, 12) and the sampling frequency fs. The
 reader of CSV files follows the description of the release; it was tested on files of that form, not
 on the release itself.
 
-A submission to the site is the four sums of ``melon``, the means of its flights.
+A submission to the site has the four sums of ``melon``, each a mean over its flights.
 
 References:
     Busetto et al., "NanoDrone: a benchmark for the identification of an aerial robot", Control

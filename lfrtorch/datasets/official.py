@@ -32,7 +32,7 @@ BOARD = "leaderboard of nonlinearbenchmark.org"
 """Citation of a published score on nonlinearbenchmark.org."""
 
 LEGACY = f"{BOARD}, before it fixed its splits"
-"""Citation of such a score on samples, estimation or test, that the site no longer uses."""
+"""Citation of such a score if its estimation or test samples differ from the site's of today."""
 
 
 def cache() -> Path:
@@ -59,7 +59,7 @@ def find(
     others: Sequence[str] = (),
     download: bool = False,
 ) -> Path:
-    """Path of a benchmark's ``root / file``, or of the first existing one of ``others``.
+    """Path of the file ``root / file`` of a benchmark, or of the first of ``others`` that exists.
 
     The function ``loader`` of nonlinear_benchmarks fetches a missing file, if ``download``.
     """
@@ -227,7 +227,7 @@ def chosen_levels(levels: Sequence[int], known: Sequence[int]) -> list[int]:
 
 
 def _there(path: Path) -> bool:
-    """Tell if a file exists and is no empty archive."""
+    """Tell if a file exists and is not an empty archive."""
     return path.is_file() and (path.suffix != ".zip" or path.stat().st_size > 0)
 
 
@@ -283,7 +283,7 @@ def _numbers(path: Path, name: str, found: NDArray[Any], shapes: Sequence[Shape]
 
 @contextmanager
 def readable(path: Path, what: str) -> Iterator[None]:
-    """Name the file that is read inside if it is damaged, for which readers have many errors."""
+    """Name the file in errors of reading it, of which readers have many kinds."""
     try:
         yield
     except Exception as error:

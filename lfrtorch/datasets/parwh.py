@@ -4,8 +4,8 @@ Input u (V), output y (V), in steady state, at 78125 Hz: periods of 16384 sample
 multisines at five levels, and a test of growing amplitude, the arrow. The official file has two
 periods of every record, and at each level 20 realisations for estimation and one more as a test.
 The stand-in has records of the same shapes (:mod:`lfrtorch.datasets.parwh_simulator`). The
-``source`` of each record names its origin: scores on the stand-in are no scores on the official
-data.
+``source`` of each record names its origin: scores on the stand-in do not compare with scores on the
+official data.
 
 The official file is read directly. The package nonlinear_benchmarks, which downloads it,
 interleaves the two periods sample by sample and leaves the arrow out.
@@ -75,7 +75,7 @@ def load(
     unscored. The second of the two periods of a test is scored.
 
     Official data: the last of the 20 realisations validates, the others train. The stand-in's tests
-    are noise free, its training and validation are not.
+    have no noise; its training and validation records have.
 
     Args:
         source: ``"official"``, downloaded by the package nonlinear_benchmarks if it is missing;

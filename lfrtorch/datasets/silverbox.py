@@ -51,7 +51,7 @@ def load(
     measurement, and the effect of a zero state on the output (40 to 80 mV) fades by a factor of 6
     every 50 samples only. After the 50 samples that the tests leave out it would still add 0.14 mV
     to the rms error of the multisine test. So that test and validation begin ``warm_up`` samples
-    earlier, with the input of the samples before theirs, and training leaves as many out.
+    earlier, with the inputs measured there, and training leaves as many samples out.
 
     Args:
         validation: last fraction of the estimation samples, which validates.

@@ -8,14 +8,14 @@ used here), u and y. ``WH_EstimationExample.mat`` (10 records) is for estimation
 ``WH_TestDataset.mat`` has the two tests, a random-phase multisine and a swept sine up to 15 kHz,
 16384 samples and 0.71 V rms each, measured *without* process noise.
 
-Noise before a nonlinearity is not noise at the output. The simulation error on records that have it
-has a large floor, and the fit that minimises it tends to the mean output given the input,
-E f(x + e) in place of f(x): a smoother saturation than the tests', a bias which does not fade with
-more data. So errors on training and validation do not measure those on the tests, neither in size
-nor, near the floor, in order.
+Noise before a nonlinearity is not noise at the output. The simulation error on records with such
+noise has a large floor. A fit that minimises it tends to the mean output given the input,
+E f(x + e) in place of f(x): a smoother saturation than in the tests. This bias does not fade with
+more data. So errors on training and validation records do not predict errors on the tests: neither
+their size nor, near the floor, their order.
 
-There is no official split or window, and no statement that records begin at rest (and none of this
-is checked on the files). All are simulated from zero state, whose effect lies in the first 100
+There is no official split or window, and no statement that records begin at rest; none of this is
+checked on the files. All records are simulated from zero state, whose effect lies in the first 100
 samples; these are not scored, as in identibench.
 
 References:

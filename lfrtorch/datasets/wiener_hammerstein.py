@@ -43,10 +43,10 @@ def load(
     The tests are ``"test"``, the official one, and ``"site"``. ``split="site"`` trains on the
     site's estimation part, which overlaps ``"test"``, and leaves ``"site"`` alone.
 
-    Validation and ``"test"`` begin amid the measurement. They are simulated from zero state, 1000
-    samples ahead of what they score: validation begins that much earlier, in the training part, and
-    the official test score leaves its first 1000 samples out. The start state of ``"site"`` is
-    fitted to the 50 samples that are not scored.
+    Validation and ``"test"`` begin amid the measurement. They are simulated from zero state, from
+    1000 samples before their scored ones on: validation begins that much earlier, in the training
+    part, and the official test score leaves its first 1000 samples out. The start state of
+    ``"site"`` is fitted to the 50 samples that are not scored.
 
     Args:
         split: ``"official"`` or ``"site"``.
