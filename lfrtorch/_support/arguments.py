@@ -29,7 +29,7 @@ _NAMES: dict[Any, str] = {
 def typed(*own: str) -> Callable[[Function], Function]:
     """Make a function or class refuse arguments of other types than its hints name.
 
-    Numbers and arrays alone are left to the function, and so are the arguments ``own``.
+    The function itself checks numbers, arrays and the arguments ``own``.
     """
 
     def decorate(function: Function) -> Function:

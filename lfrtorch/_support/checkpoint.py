@@ -46,7 +46,7 @@ def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Te
             write_tensors(fresh / _WEIGHTS, weights)
         return folder
     before = _described(folder)
-    if before == json.loads(json.dumps(described)):  # the same model with other weights
+    if before == json.loads(json.dumps(described)):  # the same model, with other weights
         _replace(folder / _WEIGHTS, weights)
     else:  # two files cannot be replaced at once: never the weights that the description names
         for name in (_WEIGHTS,) if before.get("weights") == _NEXT else (_NEXT, _WEIGHTS):
@@ -69,7 +69,7 @@ def write_tensors(path: Path, tensors: dict[str, Tensor], **metadata: str) -> No
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read a safetensors file and its metadata; older files have no digest."""
     if path.exists() and not path.is_file():
-        raise OSError("it is no file")
+        raise OSError("it is not a file")
     try:
         check_memory(path.stat().st_size, "it", "copy it again")
         with safe_open(path, framework="pt") as file:

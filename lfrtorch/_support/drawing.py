@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from lfrtorch._support.tables import engineering, factor_of
 from lfrtorch._support.types import Array
 
-# Okabe and Ito's palette: colour-blind readers tell its colours apart, which differ in lightness.
+# Okabe and Ito's palette: its colours differ in lightness, so that colour-blind readers see them.
 
 OUTPUT = "0.15"
 """Colour of the measured output."""
@@ -28,7 +28,7 @@ NL_LFR = "#0072b2"
 CHANNELS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Colours of several channels."""
 
-_LOG_DECADES = 1.5  # width of a band from which on the frequency axis is logarithmic
+_LOG_DECADES = 1.5  # smallest width of a band for a logarithmic frequency axis
 
 
 def panels(

@@ -23,7 +23,7 @@ def is_frame(value: Any) -> bool:
 
 
 def index_times(frame: Any) -> Array | None:
-    """Index in seconds from its first entry; None if it counts rows or is no time."""
+    """Index in seconds from its first entry; None if it counts rows or is not a time."""
     import pandas as pd
 
     index = frame.index
@@ -59,7 +59,7 @@ def index_grid(frame: Any, fs: float | None, used: Sequence[int] = ()) -> tuple[
     if t is None or len(t) < 2:
         if fs is None:
             raise InputError(
-                "the frame's index is no time; give fs=HZ, or an index of date-times or seconds: "
+                "the frame's index is not a time; give fs=HZ or an index of date-times or seconds: "
                 "df.set_index('t')."
             )
         return fs, Piece.of(0, len(frame))
@@ -94,11 +94,11 @@ def index_grid(frame: Any, fs: float | None, used: Sequence[int] = ()) -> tuple[
 
 
 def check_index(frame: Any, fs: float) -> None:
-    """Refuse an index that is no even time at ``fs`` in Hz."""
+    """Refuse an index that is not an even time at ``fs`` in Hz."""
     places = index_grid(frame, fs)[1].places
     if not np.array_equal(places, np.arange(len(frame))):
         raise InputError(
-            f"the frame's index is no even time; Record.from_frame(df, ..., fs={fs:g}) makes a "
+            f"the frame's index is not an even time; Record.from_frame(df, ..., fs={fs:g}) makes a "
             "record on even times, which the model simulates."
         )
 

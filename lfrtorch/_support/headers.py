@@ -25,7 +25,7 @@ def bracketed(text: str) -> str | None:
 
 
 def _parts(header: str) -> tuple[str, str]:
-    """Parts of a header before and in its last brackets; empty without short ones at its end."""
+    """Parts of a header before and in the brackets at its end, if these are short; else empty."""
     found = _BRACKETS.fullmatch(header)
     inside = found[2].strip() if found else ""
     return (found[1], inside) if found and 0 < len(inside) <= 16 else (header, "")

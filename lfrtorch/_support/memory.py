@@ -49,7 +49,7 @@ def _own_limit() -> float:
 
 
 def limit_of(listed: Path, mounted: Path) -> float:
-    """Return the least memory limit of the control groups of a process, inf if there is none."""
+    """Return the smallest memory limit of the control groups of a process, inf if there is none."""
     # ``listed`` has a line for each group, ``mounted`` the limits; a group limits those inside it.
     # Linux kernel documentation, "Control Group v2", and its v1 with "memory.limit_in_bytes".
     try:

@@ -9,15 +9,15 @@ from lfrtorch._support.errors import InputError, brief
 
 
 def expanded(path: str | Path) -> Path:
-    """Expand ``~`` in a path; refuse one that no file can have, too long or of an unknown user."""
+    """Expand ``~`` in a path; refuse a path that no file can have: too long, or an unknown user."""
     try:
         found = Path(path).expanduser()
-        found.is_file()  # an error, unless a file has that name
+        found.is_file()  # raises an error if no file can have that name
         if "\0" in str(found):  # pathlib has no error for it
             raise ValueError("it has a zero byte")
     except (OSError, RuntimeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{brief(repr(str(path)))} is no path ({reason}); correct it.") from None
+        raise InputError(f"{brief(repr(str(path)))} is not a path ({reason}); mend it.") from None
     return found
 
 

@@ -43,7 +43,7 @@ def beyond(root: Mapping[str, Any]) -> bool:
 
 
 def remark(root: Mapping[str, Any], *, pole: bool) -> str:
-    """Remark on a root that stands for two or is above fs / 2, or on an unstable pole."""
+    """Remark on a root that is one of a pair or above fs / 2, or on an unstable pole."""
     said = {
         "pair": bool(root["imag"]),
         "above fs / 2": beyond(root),

@@ -18,8 +18,8 @@ _WORDS = (
 )
 _ENDINGS = "id", "no", "nr", "num", "number", "index", "idx", "name"
 _NAMES = re.compile(rf"({'|'.join(_WORDS)})s?([ _.-]?({'|'.join(_ENDINGS)}))?|id", re.IGNORECASE)
-_LEAST = 20  # least samples of most runs
-_AGAIN = 10  # steps: latest begin of a run after the end of the run before
+_LEAST = 20  # smallest number of samples of most runs
+_AGAIN = 10  # steps: the time of a run's start is at most so much later than the last run's
 
 
 class Runs(NamedTuple):

@@ -11,12 +11,12 @@ import numpy as np
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Booleans, Integers
 
-_GAP = 1.5  # steps between stamps from which on samples are missing
-_OFTEN = 0.1  # part of the samples: with more gaps than that, the stamps are rounded
-_ROUNDED = 1.01  # digits: largest distance of a stamp from the grid if the last digit rounds
-_HOLE = 5.0  # steps without a sample that no line is drawn over
-_SAME = 1e-3  # relative: sampling frequencies that do not contradict one another
-_USUAL = 0.1  # the same where stamps are uneven
+_GAP = 1.5  # steps between two stamps, from which on samples are missing
+_OFTEN = 0.1  # with more gaps than this part of the samples, the stamps are rounded
+_ROUNDED = 1.01  # largest distance of a rounded stamp from the grid, in units of its last digit
+_HOLE = 5.0  # longer stretches without a sample, in steps, are not interpolated
+_SAME = 1e-3  # largest relative difference of sampling frequencies that agree
+_USUAL = 0.1  # the same if the stamps are uneven
 
 
 class Sampling(NamedTuple):
@@ -31,13 +31,13 @@ class Sampling(NamedTuple):
     def __str__(self) -> str:
         """Interpretation of a column: its unit, the frequency and its uncertainty."""
         unit = f" in {self.unit}" if self.unit else ""
-        # A frequency of the same certainty is printed without it.
+        # The uncertainty is only printed if it is larger than the rounding of the frequency.
         off = f" ± {100 * self.uncertainty:.1g} %" if self.uncertainty > 1e-3 else ""
         return f"the time{unit}, {self.fs:.6g} Hz{off}"
 
 
 class UnevenError(InputError):
-    """Error of a column that is no even grid of time: its fault, the sample, and a remedy."""
+    """Error of a column that is not an even time: its fault, the sample, and a remedy."""
 
     def __init__(
         self, message: str, sample: int, remedy: str = "resample the signals to an even grid"
@@ -113,7 +113,7 @@ def even_times(t: Array, fs: float | None = None, *, whole: bool = False) -> Eve
     Args:
         t: time stamps in seconds (T,).
         fs: rate of the grid in Hz. Default: the rate of the stamps.
-        whole: every missing sample is a hole; otherwise five steps without one are.
+        whole: every missing sample is a hole; otherwise five steps without a sample are one.
 
     Raises:
         UnevenError: stamps that do not rise.

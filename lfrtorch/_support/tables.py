@@ -28,7 +28,7 @@ _NEVER_LARGER = ("s", "rad")  # first letters of units that are never kilo or mo
 _NEAR, _ROUNDING = 1e-3, 1e-12
 
 WIDEST = 160
-"""Most characters of a line of a message."""
+"""Largest number of characters of a line of a message."""
 
 Cell = str | int | float | None
 

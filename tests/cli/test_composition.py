@@ -217,7 +217,7 @@ def test_paths_that_hydra_would_read_otherwise(tmp_path: Path, monkeypatch: pyte
         (["x.csv", "path=x.csv"], "data.path is given twice"),
         (["x.csv", "input=u"], "no setting 'input'; did you mean data.inputs=u?"),
         (["inputs=u,v"], "data.inputs is of no use before data are chosen: add a file, or +bench="),
-        (["q" * 300 + ".csv"], "is no path (File name too long)"),
+        (["q" * 300 + ".csv"], "is not a path (File name too long)"),
     ],
 )
 def test_few_words_that_are_wrong(words, message, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -895,7 +895,7 @@ def test_refused_paths(tmp_path):
     with pytest.raises(ValueError, match=r"save it as \.xlsx"):
         open_table(tmp_path / "book.xls")
     for name in (f"{'n' * 300}.csv", "~nobody-of-that-name/a.csv", "a\0.csv"):
-        with pytest.raises(ValueError, match=r"is no path \("):
+        with pytest.raises(ValueError, match=r"is not a path \("):
             open_table(name)
     (tmp_path / "circle.csv").symlink_to(tmp_path / "circle.csv")
     with pytest.raises(FileNotFoundError, match=r"no file '.*circle\.csv'"):

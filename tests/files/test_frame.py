@@ -52,7 +52,7 @@ def test_a_column_of_date_times_tells_the_rate(zone: str | None):
 
 
 def test_rows_that_only_count_need_a_rate():
-    with pytest.raises(InputError, match="index is no time; give fs=HZ"):
+    with pytest.raises(InputError, match="index is not a time; give fs=HZ"):
         Record.from_frame(frame(), "force", "disp")
     assert Record.from_frame(frame(), "force (N)", "disp/mm", 20.0).fs == 20.0
     with pytest.raises(InputError, match="sampling frequency of 'frame' is not known"):
@@ -77,7 +77,7 @@ def test_what_is_wrong_with_a_frame_is_said():
     twice = pd.concat([frame(index=STAMPS)] * 2, axis=1)
     with pytest.raises(InputError, match=r"the frame has 2 columns 'force \(N\)', of the inputs"):
         Record.from_frame(twice, "force (N)", "disp/mm")
-    with pytest.raises(InputError, match="index is no time; give fs=HZ"):
+    with pytest.raises(InputError, match="index is not a time; give fs=HZ"):
         Record.from_frame(frame(index=STAMPS).iloc[:0], "force", "disp")
     with pytest.raises(InputError, match="give a pandas DataFrame"):
         Record.from_frame(U, "force", "disp")

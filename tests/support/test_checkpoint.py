@@ -139,7 +139,7 @@ def test_own_class_that_is_called_like_the_network(tmp_path: Path):
 
 def test_no_checkpoint(tmp_path: Path):
     refused(tmp_path / "nowhere", "nowhere'; give the folder of a run")
-    with pytest.raises(ValueError, match=r"is no path \(File name too long\)"):
+    with pytest.raises(ValueError, match=r"is not a path \(File name too long\)"):
         load("n" * 400)
     refused(tmp_path, "is not a checkpoint")
 
@@ -317,7 +317,7 @@ def test_weights_that_make_no_model(saved: Path, name: str, value: float, messag
 def test_weights_that_are_no_file_are_not_waited_for(saved: Path):
     (saved / "weights.safetensors").unlink()
     os.mkfifo(saved / "weights.safetensors")
-    refused(saved, "is damaged or missing (it is no file)")
+    refused(saved, "is damaged or missing (it is not a file)")
 
 
 # --- code is never run ----------------------------------------------------------------------
