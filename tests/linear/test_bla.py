@@ -677,7 +677,7 @@ def test_deviation_of_a_fit_weighted_by_noise_counts_distortion():
     ("distortion", "nx", "weight", "cause"),
     [
         (0.3, 2, "noise", ": nonlinear distortion or too low an order"),
-        (0.0, 1, "total", "total deviation: too low an order"),
+        (0.0, 1, "total", "total standard deviation: too low an order"),
         (0.0, 2, "noise", None),
         (0.0, 2, "total", None),
         (0.3, 2, "total", None),
