@@ -57,7 +57,7 @@ def test_tanks_that_an_estimated_start_hurts_begin_from_rest():
 
 
 def test_no_linear_model_of_a_short_record():
-    with pytest.raises(ValueError, match="has 36 samples; to tell .* takes 40"):
+    with pytest.raises(ValueError, match=r"has 36 samples; to tell .* takes 40"):
         try_starts(resonance(0)[:36])
 
 
