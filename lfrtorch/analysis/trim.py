@@ -32,7 +32,7 @@ class Trim:
         x: state in the model's coordinates.
         u, y: input and output, physical units.
         residual: y minus the wanted output; 0 for outputs that were free.
-        outside: what the data of the fit did not reach of this point, in words; empty if all of it.
+        outside: parts of this point that the data of the fit did not reach, in words; or empty.
 
     Example:
         >>> found = lfrtorch.analysis.trim(model, u=0.5)

@@ -157,7 +157,7 @@ def examine(
     Args:
         found: its survey. Without inputs all signals count as outputs.
         skipped: number of skipped samples before these, added to the sample numbers in notes.
-        moving: whether each input moves elsewhere, in other records or in skipped samples.
+        moving: True for inputs that move elsewhere, in other records or in skipped samples.
         given: arguments of :func:`lfrtorch.estimate_bla` that are set: notes do not advise what
             these do already.
     """
