@@ -93,7 +93,7 @@ def fit(
     selection: Record | Sequence[Record] = (),
     *,
     trainer: Trainer | None = None,
-    ridge: Ridge = 0.0,
+    ridge: Ridge | Sequence[Ridge] = 0.0,
     noise: Noise = "output",
     horizon: int | None = None,
     average: int = 1,
@@ -130,7 +130,8 @@ def fit(
             that are not fitted: starts that fit alike differ there (``benchmarks/starts.md``).
             Starts are judged on validation and selection, and without both on training.
         trainer: the search. Default: Levenberg-Marquardt.
-        ridge: weight of |θ - θ_start|², see ``lfrtorch.least_squares.problem``.
+        ridge: weight of |θ - θ_start|², see ``lfrtorch.least_squares.problem``. A list has that of
+            each model.
         noise: where it acts. ``"output"``: on the outputs, and the simulation error is minimised.
             ``"innovation"``: inside the system, too, and the error of the prediction one sample
             ahead is minimised; all errors are those of predictions, and the model of the result
@@ -189,11 +190,13 @@ def fit(
     refuse_together(noise=noise, horizon=horizon, guarantee=guarantee)
     options: dict[str, Any] = {
         "trainer": LevenbergMarquardt() if trainer is None else trainer,
-        "ridge": ridge,
         "horizon": horizon,
         "stop": stop,
     }
-    found = partial(_fitted, average=average, watch=watch, snapshots=snapshots, options=options)
+    ridges: list[Any] = [*ridge] if isinstance(ridge, list | tuple) else [ridge]
+    found = partial(
+        _fitted, ridges=ridges, average=average, watch=watch, snapshots=snapshots, options=options
+    )
     models = models if isinstance(models, Model) else _different(models)
     with using(ranks):
         if noise == "output":
@@ -231,6 +234,7 @@ def _fitted(
     validation: Record | Sequence[Record],
     selection: Record | Sequence[Record],
     *,
+    ridges: Sequence[Ridge],
     average: int,
     monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] | None,
     watch: Callable[[Round], None],
@@ -243,6 +247,12 @@ def _fitted(
     given = [monitors] if alone and monitors is not None else monitors
     watching = cast(Sequence[Sequence[Monitor]], given or ())
     _check(starts, watching, average)
+    ridges = [*ridges] * len(starts) if len(ridges) == 1 else ridges
+    if len(ridges) != len(starts):
+        raise InputError(
+            f"there are {len(starts)} models and {len(ridges)} ridges; give one, or each model its "
+            "own."
+        )
     validation, selection = (
         [*map(with_window, as_records(some))] if some else [] for some in (validation, selection)
     )
@@ -258,8 +268,15 @@ def _fitted(
         same_weights(starts)
     with using(sharing):
         fits = [
-            Fit(model, train, validation, **{**options, **own}, keep=snapshots.keeper(number))
-            for number, model in enumerate(starts)
+            Fit(
+                model,
+                train,
+                validation,
+                ridge=each,
+                **{**options, **own},
+                keep=snapshots.keeper(number),
+            )
+            for number, (model, each) in enumerate(zip(starts, ridges, strict=True))
         ]
     if all(one.diverges for one in fits):
         which = "the model diverges" if len(fits) == 1 else "all models diverge"
@@ -321,7 +338,8 @@ def _fitted(
         best = judge.stable(field, as_records(train))[:average]
         mean, count = judge.mean(best)
         if mean is not None:
-            result = replace(result, model=mean, averaged=count, members=tuple(best[:count]))
+            members = tuple(best[:count]) if count > 1 else ()
+            result = replace(result, model=mean, averaged=count, members=members)
     given = any(record.start == "given" for record in (*train, *unseen))
     for model in (result.model, *result.members):
         scale_states(model, train, keep_coordinates=given)
@@ -437,7 +455,7 @@ class _Judge:
         # None if a single start is better than all means. Without records to judge on, the mean of
         # all.
         if not self._records:
-            return (mean_model(best), len(best)) if len(best) > 1 else (None, 1)
+            return (mean_model(best), len(best)) if len(best) > 1 else (next(iter(best), None), 1)
         means = [mean_model(best[:count]) for count in range(2, len(best) + 1)]
         scores = [_cost(self._error(mean)) for mean in means]
         scores = self._same([min(map(self._score, self._fits)), *scores])

@@ -19,13 +19,16 @@ from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.refit import estimation_records
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Job, Stage
-from lfrtorch.fitting.start_models import STARTS_OF_CHOSEN, starting_model
+from lfrtorch.fitting.start_models import starting_model
 from lfrtorch.fitting.windows import begins_at_outputs
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.model import Model
 
 _CHOOSING = 20_000
 """Training samples that sizes are chosen with, at most."""
+
+_MEMBERS = 8
+"""Most starts that a model of chosen sizes is the mean of."""
 
 _ITERATIONS = 75
 """Iterations of a fit without validation: about as many as its ridge was chosen with."""
@@ -60,12 +63,11 @@ def _of_choice(settings: Settings, choice: Choice) -> Settings:
     sizes = {name: choice.chosen.sizes[name] for name in settings.size_names}
     if settings.known is None:
         sizes["nx"] = choice.chosen.sizes["nx"]
-    averages = settings.averages and allowed("average", STARTS_OF_CHOSEN, vars(settings))
     return replace(
         settings,
         **sizes,
         ridge=choice.chosen.ridge,
-        average=STARTS_OF_CHOSEN if settings.static == "network" and averages else 1,
+        average=len(choice.members),
         refit=False,
         trainer=replace(trainer, max_iter=min(trainer.limit, _ITERATIONS)),
     )
@@ -99,6 +101,8 @@ def _choice(job: Job) -> Choice:
         return with_given(begun, settings.fixed)[0]
 
     searched = settings.nx == "auto"
+    averages = settings.static == "network" and settings.averages and not at_outputs
+    averages = averages and allowed("average", _MEMBERS, vars(settings))
     choice = choose_sizes(
         records,
         [nx for nx in orders if nx <= job.linear.nx] if searched else [job.linear.nx],
@@ -108,6 +112,7 @@ def _choice(job: Job) -> Choice:
         ridge=0.0 if settings.ridge == "auto" else settings.ridge,
         last=settings.size_names[-1],
         seed=settings.seed,
+        average=_MEMBERS if averages else 1,
         guarantee="stable" if settings.trainer.guarantee == "stable" else None,
         horizon=settings.horizon,
         watch=observer.say,

@@ -55,7 +55,7 @@ class Job:
         begun: that of the order that models start with.
         order_scan, choice: choice of its order, and of the sizes.
         models: where the next fit starts.
-        ridge: ridge of the next fit, if it differs from the settings.
+        ridge: ridge of the next fit, or that of each model, if it differs from the settings.
         result, again: the fit, and that to all estimation records.
     """
 
@@ -70,7 +70,7 @@ class Job:
     order_scan: OrderScan | None = None
     choice: Choice | None = None
     models: Sequence[Model] = ()
-    ridge: Ridge | None = None
+    ridge: Ridge | Sequence[Ridge] | None = None
     result: FitResult = _LATER
     again: FitResult | None = None
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -91,6 +91,19 @@ class Run:
         again = "Refitted to all estimation records: validation errors are those before it."
         return [mean] * (self.fit.averaged > 1) + [again] * (self.refit is not None)
 
+    @property
+    def started(self) -> list[str]:
+        """Names of the starts: the seed of each, and its sizes if they differ."""
+        if self.choice is None or not self.choice.averages:
+            return [str(seed) for seed in self.settings.seeds]
+        return [f"{c.seed}, {scores.in_words(c.sizes)}" for c in self.choice.members]
+
+    @property
+    def _seeds(self) -> Sequence[int]:
+        if self.choice is None or not self.choice.averages:
+            return self.settings.seeds
+        return [member.seed for member in self.choice.members]
+
     def __repr__(self) -> str:
         sizes = ", ".join(f"{name}={size}" for name, size in self.model.sizes.items())
         return f"Run({self.dataset.name}, {sizes}, {self.fit.outcome})"
@@ -104,7 +117,7 @@ class Run:
         )
         if len(fit.starts) > 1:
             unit = common_unit(self.model.outputs)
-            parts.append(scores.starts_table(fit, self.settings.seeds, unit) + "\n")
+            parts.append(scores.starts_table(fit, self.started, unit) + "\n")
         parts += [f"{said}\n" for said in self.origins]
         parts.append(scores.table(self.evaluation, fit.averaged))
         if self.parameters is not None:
@@ -149,7 +162,7 @@ class Run:
             "starts": max(1, len(fit.starts)),
             "averaged": fit.averaged,
             "ranking": [
-                {"seed": self.settings.seeds[start.number], **asdict(start)} for start in fit.starts
+                {"seed": self._seeds[start.number], **asdict(start)} for start in fit.starts
             ],
         }
         return finite(entries)
