@@ -63,8 +63,8 @@ class Survey:
 
     def __str__(self) -> str:
         legend = [
-            "rms: about the mean; run: longest at an extreme; from, to: the band of 99 % of the "
-            "power."
+            "rms: without the mean; run: most samples in a row at an extreme; from, to: band with "
+            "99 % of the power."
         ]
         methods = {one.method for one in self.signals}
         if "periods" in methods:
