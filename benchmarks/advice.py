@@ -142,7 +142,7 @@ CASES: dict[str, Callable[[Path], Signals]] = {
 }
 
 HELD_OUT = "Overfitting would not show"
-OTHER_PARTS = "The validation part is unlike", "The models hold in training alone", "The gain on"
+OTHER_PARTS = "The validation part is unlike", "The models are good in training only", "The gain on"
 NO_MORE = (
     "Noise-limited",
     "The system is linear at this level",

@@ -1,7 +1,7 @@
-"""Advice after a fit, from numbers alone: a table of rules, a row each.
+"""Advice after a fit, from numbers alone: a table with a rule in each row.
 
-The numbers, and the thresholds that several rules share, are those of
-:mod:`lfrtorch.reporting.diagnosis`.
+:mod:`lfrtorch.reporting.diagnosis` computes the numbers, and has the thresholds that several rules
+share.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from lfrtorch.reporting.diagnosis import (
 )
 from lfrtorch.reporting.sentences import Said, said
 
-_TRANSIENT = 3.0  # error in the first twentieth of the scored samples over that in the rest
-_CLOSE = 1.2  # growth as of OVERFIT, up to which a larger map is advised
-_FEW = 3  # most records or outputs that are named
+_TRANSIENT = 3.0  # error in the first twentieth of the scored samples over the error in the rest
+_CLOSE = 1.2  # largest growth (as for OVERFIT) with which a larger map is advised
+_FEW = 3  # at most so many records or outputs are named
 
 
 class Advice(NamedTuple):
     """A sentence that says what to do or to know."""
 
     text: str  # the sentence, in at most 160 characters
-    evidence: str  # the numbers that it rests on
-    change: Mapping[str, Any] | None = None  # fields of the settings, if a program can follow it
-    words: str = ""  # of the command line, if they are not those of the change
+    evidence: str  # the numbers behind the sentence
+    change: Mapping[str, Any] | None = None  # new fields of the settings; None if none follow it
+    words: str = ""  # words of the command line in place of those of the change
 
     def command(self, before: str) -> str:
-        """The command of the run with what is advised; empty if no word of it follows it.
+        """The command ``before``, changed to follow the advice; empty if no words follow it.
 
         Example:
             >>> Advice("", "", {"ridge": "auto"}).command("lfrtorch fit x.csv fs=10 ridge=1e-3")
@@ -56,17 +56,17 @@ class Advice(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """A row of the table: when it speaks, what it says and why, and what to change."""
+    """A row of the table: when the rule applies, its advice and evidence, and what to change."""
 
     when: Callable[[Evidence], bool]
     text: Said
-    because: Said  # empty if there is nothing to say
+    because: Said  # the evidence; if it is empty, the rule gives no advice
     change: Callable[[Evidence], Mapping[str, Any]] = lambda _: {}
     words: str = ""
-    instead: str = ""  # of the change in the sentence, if there is none
+    instead: str = ""  # text in place of {change}, if the rule changes no setting
 
     def __call__(self, e: Evidence) -> Advice | None:
-        """Advice of the rule, if there is any."""
+        """Advice of the rule; None if the rule does not apply."""
         if not self.when(e):
             return None
         change = self.change(e)
@@ -77,12 +77,13 @@ class Rule(NamedTuple):
 
 def advise(evidence: Evidence) -> list[Advice]:
     """List the advice that the numbers suggest, the most useful first."""
-    # At the noise, and where the inputs explain little, there is no advice on sizes and search.
+    # If the error is noise, or the inputs explain little, other sizes or a longer search do not
+    # help.
     e = evidence
     without = e.noise_limited or e.nothing_left or e.unexplained
     rules = [*_OF_DATA.values(), *([] if without else _OF_MODEL.values()), *_OF_USE.values()]
     found = [advice for rule in rules if (advice := rule(e)) is not None]
-    # More is not to be measured while there is something else to do.
+    # To measure more is advised only if there is no other advice.
     return found or [advice for advice in [RULES["noise_unknown"](e)] if advice is not None]
 
 
@@ -91,37 +92,37 @@ def _above(value: float | None, limit: float) -> bool:
 
 
 def _of_ridge(e: Evidence) -> dict[str, Any]:
-    """A ridge to be chosen, if it can be and there is none."""
+    """Change that has the ridge chosen; empty if there is a ridge, or none can be chosen."""
     return {} if e.ridge or e.given else {"ridge": "auto"}
 
 
 def _overfit(e: Evidence) -> str:
-    """Growth of the error beyond training, or while training goes on; empty if there is none."""
+    """Tell how far the error grows beyond training, or during it; empty if it does not grow."""
     part, growth = max(e.growths.items(), key=lambda item: item[1], default=("", 0.0))
     if growth <= OVERFIT:
         return (
-            f"after the kept iterate validation is at {number(e.risen)} times its error, and "
+            f"after the kept iterate the validation error is {number(e.risen)} times as large, and "
             f"training fell to {percent(e.fell)}; {number(e.samples / max(1, e.parameters))} "
             "samples a parameter"
         ) * e.overtrained
     return (
         f"{part} error {percent(e.test if part == 'test' else e.validation)}, training error "
-        f"{percent(e.train)}: {number(growth)} times the growth of the linear model's"
-    ) * (part != "test" or not e.lost_on_tests)  # said there
+        f"{percent(e.train)}: {number(growth)} times the growth of the linear model's error"
+    ) * (part != "test" or not e.lost_on_tests)  # else gain_is_lost says it
 
 
 def _gains_little(e: Evidence) -> bool:
-    """No gain over the linear model, of which no states are missing."""
+    """Tell if the NL-LFR is hardly better than the linear model, and no other rule says why."""
     return e.useless and not (e.parts_differ or e.neither or e.states_missing or e.overtrained)
 
 
 def _is_small(e: Evidence) -> bool:
-    """Likewise, of given sizes and above the noise."""
+    """Tell if larger sizes may give a gain: the sizes are given, and the error is not noise."""
     return _gains_little(e) and e.linear_over_noise > NOISE_LIMITED and not e.searched
 
 
 def _more(e: Evidence) -> dict[str, Any]:
-    """More starts, and larger sizes."""
+    """Change to more starts and larger sizes."""
     states = {"nx": e.nx + 1} if e.linear is None and e.nx else {}
     return {**({} if e.continued or e.started >= 8 else {"starts": 8}), **_larger(e, states)}
 
@@ -139,42 +140,42 @@ def _longer(e: Evidence) -> dict[str, Any]:
 
 
 def _map_is_small(e: Evidence) -> bool:
-    """Tell if there is evidence that the error is not noise."""
+    """Tell if the NL-LFR has a gain, and no other rule explains the error that is left."""
     other = e.useless or e.lost_on_tests or e.states_missing or e.overtrained
     return e.gain is not None and not other
 
 
 def _not_noise(e: Evidence) -> str:
-    """Evidence that the error is not noise; empty if there is none."""
+    """Evidence that the error is not noise; empty without evidence."""
     if not e.noise or e.train is None:
         part = f"explain {percent(e.nonlinear)} of the error's power"
         return f"squares and cubes of the outputs {part}" * _above(e.nonlinear, NONLINEAR)
     times = f"training error {number(e.train / e.noise)} times the noise"
     if e.linear is not None:
-        times += f", and only {percent(e.linear)} of its power linear in the inputs"
-    return times * (e.train > 1.5 * e.noise)  # from there on the model's own share is above it
+        times += f", and only {percent(e.linear)} of its power is linear in the inputs"
+    return times * (e.train > 1.5 * e.noise)  # the model's share is then larger than the noise
 
 
 def _far(e: Evidence) -> dict[str, float]:
-    """Tests that are louder than the training data, and by how much."""
+    """Tests with larger inputs than the training, and the ratio of their largest inputs."""
     return {name: ratio for name, ratio in e.louder.items() if ratio > EXTRAPOLATES}
 
 
 def _louder(e: Evidence) -> str:
-    """Text on the inputs of louder tests, and on the difference of the starts there."""
+    """Tell how large the inputs of these tests are, and how far the starts' outputs differ."""
     ratios = _listed(f"'{name}' up to {number(ratio)} times" for name, ratio in _far(e).items())
     apart = max((e.apart.get(name, 0.0) for name in _far(e)), default=0.0)
-    more = f"; by {percent(apart)} of the output's deviation the starts differ there" * bool(apart)
-    return f"the largest input, over that in training: {ratios}{more}"
+    more = f"; there the starts differ by {percent(apart)} of the output's standard deviation"
+    return f"largest input, relative to training: {ratios}{more * bool(apart)}"
 
 
 def _both_errors(e: Evidence) -> str:
     error, linear_error, which = e.judged
-    return f"{which} error {percent(error)}, of the linear model {percent(linear_error)}"
+    return f"{which} error: NL-LFR {percent(error)}, linear model {percent(linear_error)}"
 
 
 def _larger(e: Evidence, states: Mapping[str, int] | None = None) -> dict[str, int]:
-    """Sizes of a larger static map, and of more states; none if the samples do not bear them."""
+    """Sizes of a larger static map, and of more states; empty if there are too few samples."""
     if e.known and not (e.sizes.get("nn") or e.sizes.get("degree")):
         return {"nz": 2, "nw": 1, "nn": 4}
     signals = {name: max(2, e.sizes.get(name, 0) + 1) for name in ("nz", "nw")}
@@ -187,13 +188,13 @@ def _larger(e: Evidence, states: Mapping[str, int] | None = None) -> dict[str, i
 
 
 def _borne(e: Evidence, change: Mapping[str, int]) -> bool:
-    """Tell if larger sizes are advised: validation has not grown, and the samples suffice."""
+    """Tell if the data allow larger sizes: the error hardly grows, and the samples suffice."""
     growth = _weights({**e.sizes, **change}) / _weights(e.sizes)
     return (e.overfit or 0.0) <= _CLOSE and e.bears(growth)
 
 
 def _weights(sizes: Mapping[str, int]) -> int:
-    """A product of sizes that grows at least as the parameters do."""
+    """A product of sizes that grows at least as fast as the number of parameters."""
     nz, nw = sizes.get("nz", 0), sizes.get("nw", 0)
     static = (nz + 1 + nw) * max(1, sizes.get("nn", 0))
     if sizes.get("degree"):
@@ -206,7 +207,7 @@ _OF_DATA = {
         lambda e: bool(e.diverged),
         lambda e: (
             "The model is not usable yet: "
-            + "train on inputs as loud as the tests', or " * any(n in _far(e) for n in e.diverged)
+            + "train on inputs as large as the tests', or " * any(n in _far(e) for n in e.diverged)
             + f"use {_written(_of_ridge(e)) or ('a larger ridge' if e.ridge else 'ridge=1e-3')}."
         ),
         lambda e: f"the NL-LFR diverges on {_listed(map(repr, e.diverged))}",
@@ -214,12 +215,12 @@ _OF_DATA = {
     ),
     "inputs_explain_little": Rule(
         lambda e: e.unexplained and not e.diverged,
-        "The inputs explain little of the outputs: look at the columns, delays and units, and for "
-        "other inputs (lfrtorch preview).",
-        "training error {train:%}, of the linear model {linear_train:%}",
+        "The inputs explain little of the outputs: check the columns, delays and units, and look "
+        "for other inputs (lfrtorch preview).",
+        "training error: NL-LFR {train:%}, linear model {linear_train:%}",
     ),
     "holds_in_training_alone": Rule(
-        # Said where the parts differ; or the models do not even hold there.
+        # If the parts differ, another rule says so; with a large training error no model is good.
         lambda e: (
             e.neither
             and bool(e.linear_train)
@@ -227,9 +228,9 @@ _OF_DATA = {
             and e.train is not None
             and not (e.parts_differ or e.train > UNEXPLAINED)
         ),
-        "The models hold in training alone: the other parts are unlike, too short or at rest, or "
-        "begin in another state (start='estimated').",
-        "training error {train:%}, of the linear model {linear_train:%}",
+        "The models are good in training only: the other parts are unlike it, too short or at "
+        "rest, or begin in another state (start='estimated').",
+        "training error: NL-LFR {train:%}, linear model {linear_train:%}",
     ),
     "validation_is_unlike": Rule(
         lambda e: e.parts_differ,
@@ -240,16 +241,16 @@ _OF_DATA = {
     ),
     "gain_is_lost": Rule(
         lambda e: e.lost_on_tests and not e.parts_differ and not e.neither,
-        "The gain on {judged[2]} is lost on the tests: they are unlike, or the model is overfit; "
-        "hold out a longer part (validation=0.4), or measure longer.",
-        "error over the linear model's: {judged[2]} {gain:%}, tests {tests:%}",
+        "The gain on {judged[2]} is lost on the tests: these are unlike it, or the model is "
+        "overfit; hold out a longer part (validation=0.4), or measure longer.",
+        "error relative to the linear model's: {judged[2]} {gain:%}, tests {tests:%}",
         words="validation=0.4",
     ),
     "nothing_held_out": Rule(
         lambda e: e.validation is None and e.linear_validation is None and e.train is not None,
         lambda e: (
             ("Hold" if e.lost_on_tests else "Overfitting would not show: hold")
-            + " out a part (validation=0.2) to choose iterations and sizes, then fit all with them."
+            + " out a part (validation=0.2) to choose iterations and sizes, then fit all samples."
         ),
         "{parameters} parameters are fitted to {samples} samples",
         words="validation=0.2",
@@ -257,32 +258,32 @@ _OF_DATA = {
     "starts_in_a_transient": Rule(
         lambda e: _above(e.transient, _TRANSIENT) and _above(e.free, 0.5),
         "The records do not begin at the model's rest: skip more samples (skip=N), or estimate "
-        "their starts (start='estimated').",
-        "in their first twentieth the training error is {transient} times that of the rest, and a "
+        "the initial states (start='estimated').",
+        "in the first twentieth of the records the error is {transient} times that of the rest; a "
         "free response explains {free:%} of its power",
         words="start=estimated",
     ),
     "nothing_moves": Rule(
         lambda e: e.settled,
-        "Nothing held out moves: test with another record (test=FILE.csv), or put the part that "
-        "moves last.",
-        "inputs and outputs of all parts that were held out have settled",
+        "All data held out have settled: test on another record (test=FILE.csv), or on a part of "
+        "this record that moves.",
+        "inputs and outputs held out move at most a tenth as much as in training",
         words="test=FILE.csv",
     ),
     "at_the_noise": Rule(
         lambda e: e.noise_limited,
-        "Noise-limited: nothing to gain from more neurons, states or starts; more data or less "
-        "noise make the model better.",
+        "Noise-limited: more neurons, states or starts gain nothing; more data or less noise make "
+        "the model better.",
         "training error {train:%}, noise {noise:%} of the output's standard deviation",
     ),
     "nothing_left": Rule(
         lambda e: e.nothing_left,
-        "Nothing is left to find: the errors are white, and as large as the noise seems to be.",
-        "training error {train:%}, noise by the quietest part of the spectrum {guess:%} of the "
-        "output's standard deviation",
+        "Nothing is left to find: the errors are white, and about as large as the estimated noise.",
+        "training error {train:%}, noise {guess:%} of the output's standard deviation; the noise "
+        "is estimated from the quietest part of the spectrum",
     ),
 }
-"""Rules on the records and their noise."""
+"""Rules that concern the records and their noise."""
 
 _OF_MODEL = {
     "overfits": Rule(
@@ -299,7 +300,7 @@ _OF_MODEL = {
     "linear_part_incomplete": Rule(
         lambda e: e.states_missing,
         lambda e: "The linear part is incomplete: {}.".format(
-            f"nx={e.nx + 1} or nx={e.nx + 2} states beside the known ones"
+            f"add nx={e.nx + 1} or nx={e.nx + 2} states to the known ones"
             if e.known
             else (f"nx={e.nx + 1}, nx={e.nx + 2} or nx='auto'" if e.nx else "a higher nx")
         ),
@@ -318,7 +319,7 @@ _OF_MODEL = {
             _gains_little(e) and e.linear_over_noise > NOISE_LIMITED and e.searched and not e.better
         ),
         "Hardly better than the linear model at any size searched: the system is linear at this "
-        "level, or the rest is no static map of a few signals.",
+        "level, or the rest is not a static map of few signals.",
         _both_errors,
     ),
     "hardly_better": Rule(
@@ -331,8 +332,7 @@ _OF_MODEL = {
     ),
     "gain_is_small": Rule(
         lambda e: _is_small(e) and e.better,
-        "The gain on {judged[2]} is small; a longer search or larger sizes may have more: "
-        "{change}.",
+        "The gain on {judged[2]} is small; more starts or larger sizes may increase it: {change}.",
         _both_errors,
         _more,
         instead="more data",
@@ -346,15 +346,15 @@ _OF_MODEL = {
         ),
         "Some outputs gain nothing, or are linear: {change}.",
         lambda e: (
-            f"{e.judged[2]} error "
-            + _listed(f"{number(ratio)} times on '{name}'" for name, ratio in e.behind.items())
-            + " that of the linear model, and less on the others"
+            f"{e.judged[2]} error relative to the linear model's: "
+            + _listed(f"{percent(ratio)} on '{name}'" for name, ratio in e.behind.items())
+            + ", and less on the others"
         ),
         _more_outputs,
     ),
     "nonlinear_part_left_at_any_size": Rule(
         lambda e: _map_is_small(e) and e.searched,
-        "Nonlinear behaviour is left: at any size searched; more data may bear a larger map.",
+        "Nonlinear behaviour is left at any size searched; more data may allow a larger map.",
         _not_noise,
     ),
     "nonlinear_part_incomplete": Rule(
@@ -362,7 +362,7 @@ _OF_MODEL = {
         "Nonlinear behaviour is left: {change}.",
         _not_noise,
         _larger,
-        instead="more data would bear a larger map",
+        instead="more data would allow a larger map",
     ),
     "choose_sizes": Rule(
         lambda e: not (e.searched or e.given or e.validation is None or e.parts_differ),
@@ -373,26 +373,26 @@ _OF_MODEL = {
         ),
     ),
     "best_start_alone": Rule(
-        lambda e: _above(e.second, 1.2) and not e.parts_differ,  # beyond it the best may be luck
+        lambda e: _above(e.second, 1.2) and not e.parts_differ,  # the best start may be luck
         "The minimum may be a poor one: {change}.",
-        "the second best start's error is {second} times that of the best, of {started}",
+        "the error of the second best of {started} starts is {second} times that of the best",
         lambda e: {"starts": 2 * max(e.started, 4)},
     ),
     "one_start": Rule(
-        # Without validation the start that overfits most would be chosen.
+        # Without validation, the start with the largest overfit would be chosen.
         lambda e: (
             not (e.started > 1 or e.continued or e.known or e.validation is None)
             and not (e.parts_differ or (e.useless and not e.overtrained))
         ),
         "Try several starts: {change}.",
-        "one start; fits end in one of several minima",
+        "the fit had one start, and may have ended in a poor minimum",
         lambda _: {"starts": 8},
     ),
     "still_falling": Rule(
         lambda e: e.falling > FALLING and e.validation is not None,
-        "Still falling: {change}; init_from=RUN goes on from here.",
-        "at the pace of the last iterations the validation error falls by {falling:%} in a tenth "
-        "of the {iterations}",
+        "Still falling: {change}, or continue this fit with init_from=RUN.",
+        "at the last pace, the validation error falls by {falling:%} in a tenth of the "
+        "{iterations} iterations",
         _longer,
     ),
     "ended_by_limit": Rule(
@@ -404,53 +404,53 @@ _OF_MODEL = {
     "ended_by_limit_of_choice": Rule(
         lambda e: _is_spent(e) and e.searched,
         lambda e: (
-            f"The limit of {e.iterations} iterations ended every start: init_from=RUN goes on from "
-            f"here, {_written(_longer(e))}."
+            f"The limit of {e.iterations} iterations ended every start: continue this fit with "
+            f"init_from=RUN, {_written(_longer(e))}."
         ),
-        "kept iteration {iterations} of {iterations}; where sizes are chosen the limit is what "
-        "their ridge was chosen with",
+        "kept iteration {iterations} of {iterations}; a new search with another limit would "
+        "choose the ridge anew",
     ),
 }
-"""Rules on the sizes and the search."""
+"""Rules that concern the sizes and the search."""
 
 _OF_USE = {
     "tests_are_louder": Rule(
         lambda e: bool(_far(e)),
-        "Some tests extrapolate: train on inputs as loud as those the model is for.",
+        "Some tests extrapolate: train on inputs as large as those that the model is for.",
         _louder,
     ),
 }
-"""Rules on the inputs that the model is for."""
+"""Rules that concern the inputs that the model is for."""
 
 _LAST = {
     "noise_unknown": Rule(
         lambda e: e.noise is None and e.guess is None and e.train is not None and not e.structured,
         "It is unknown whether the remaining error is noise: measure two periods of a periodic "
         "input in steady state for training.",
-        "training error {train:%} of the output's standard deviation, no repeated periods in the "
-        "training records",
+        "the training error is {train:%} of the output's standard deviation, and the training "
+        "records have no repeated periods",
     ),
 }
-"""The rule that speaks if no other does."""
+"""The rule that is tried if no other rule applies."""
 
 RULES = _OF_DATA | _OF_MODEL | _OF_USE | _LAST
 """All rules by name, the most useful first."""
 
 
 def _words(change: Mapping[str, Any], write: Callable[[Any], str] = str) -> list[str]:
-    """The change as words of the command line, or as one writes it in Python."""
+    """The change as words of the command line; ``write`` makes a word of a value."""
     limits = {f"{n}.max_iter": v.limit for n, v in change.items() if n == "trainer"}
     values = limits or change
     return [f"{name}={write(value)}" for name, value in values.items()]
 
 
 def _written(change: Mapping[str, Any]) -> str:
-    """The change as one writes it."""
+    """The change as it is written in Python."""
     return ", ".join(_words(change, repr))
 
 
 def _listed(items: Iterable[str]) -> str:
-    """The first of them, and how many more there are."""
+    """The first items, and the number of the others."""
     listed = [*items]
     more = f" and {len(listed) - _FEW} more" * (len(listed) > _FEW)
     return ", ".join(listed[:_FEW]) + more

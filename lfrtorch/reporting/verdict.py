@@ -128,7 +128,7 @@ class Comparison(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparisons:
-    """The comparisons behind a verdict."""
+    """Comparisons that a verdict rests on."""
 
     whole: Comparison | None = None  # all records that judge
     records: Sequence[Comparison] = ()  # each that was not fitted

@@ -69,8 +69,8 @@ _SENTENCES = {
     "still": "no input or output moves in {share:.0f} % of the record (samples {first} to "
     "{last}): little is learnt there; cut most of it off, or excite the system all the time.",
     "clipped": "{side}'{name}' has its {what} value {end.value:.6g} in {end.samples} samples "
-    "({share:.2g} %), {end.run} in a row: it is clipped; if the sensor clips it, use a larger "
-    "range, or give its limits.",
+    "({share:.2g} %), {end.run} in a row; if the sensor clips there, use more range, or "
+    "give its limits.",
     "coarse": "{side}'{name}' has {one.values} values, in steps of {one.step:.3g} ({share:.0f} % "
     "of its rms): an rms error of about {least:.2g} is the least; use more of the converter's "
     "range.",

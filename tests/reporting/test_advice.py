@@ -102,7 +102,7 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
         ("outputs_left_out", {"outputs": {"y1": 0.95, "y2": 0.1}}, "nw=2, nz=2"),
         ("best_start_alone", {"starts": (0.02, 0.03)}, "starts=16"),
         ("one_start", {"started": 1}, "starts=8"),
-        ("tests_are_louder", {"louder": {"arrow": 1.5}}, "train on inputs as loud"),
+        ("tests_are_louder", {"louder": {"arrow": 1.5}}, "train on inputs as large"),
         ("noise_unknown", {"noise": None}, "in steady state for training."),
         ("choose_sizes", {"searched": False}, "nx='auto', nz='auto', nw='auto', nn='auto'"),
         ("nothing_at_any_size", {"validation": 0.199}, "at any size searched"),
@@ -113,19 +113,19 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
         ),
         ("hardly_better", USELESS | {"samples": 900, "started": 1}, "starts=8."),
         ("hardly_better", USELESS | {"samples": 900}, "more data."),
-        ("at_the_noise", {"train": 0.0105, "validation": 0.011}, "nothing to gain"),
-        ("holds_in_training_alone", {"verdict": UNUSABLE}, "hold in training alone"),
+        ("at_the_noise", {"train": 0.0105, "validation": 0.011}, "gain nothing"),
+        ("holds_in_training_alone", {"verdict": UNUSABLE}, "good in training only"),
         (
             "inputs_explain_little",
             {"verdict": UNUSABLE, "train": 0.95, "linear_train": 0.97, "linear_validation": 0.98},
-            "look at the columns",
+            "check the columns",
         ),
         ("gain_is_lost", {"test": 0.03, "linear_test": 0.02}, "measure longer"),
         ("overfits", {"test": 0.06, "linear_test": 0.3}, "Overfit: more data"),
         (
             "ended_by_limit_of_choice",
             {"spent": True},
-            "init_from=RUN goes on from here, trainer.max_it",
+            "continue this fit with init_from=RUN, trainer.max_it",
         ),
         ("ended_by_limit", GUESSED | {"spent": True}, "every start: trainer.max_iter=400."),
         ("nothing_moves", {"settled": True}, "test=FILE.csv"),
@@ -193,7 +193,8 @@ def test_louder_tests_say_by_how_much_the_starts_differ_there():
     found = RULES["tests_are_louder"](loud)
     assert found is not None
     assert found.evidence.endswith(
-        "'arrow' up to 1.50 times; by 12.0 % of the output's deviation the starts differ there"
+        "'arrow' up to 1.50 times; "
+        "there the starts differ by 12.0 % of the output's standard deviation"
     )
 
 
@@ -203,11 +204,11 @@ def test_nonlinear_behaviour_is_left_where_the_error_is_neither_noise_nor_linear
     polynomial = replace(guessed, sizes={"nx": 3, "nz": 1, "nw": 1, "degree": 3}, samples=9000)
     seen = replace(GOOD, noise=None, nonlinear=0.3)
     for found, said in (
-        (rule(GOOD), "at any size searched; more data may bear a larger map."),
+        (rule(GOOD), "at any size searched; more data may allow a larger map."),
         (rule(guessed), "nn=20, nz=2, nw=2. (training error 2.00 times the noise"),
         (rule(replace(guessed, samples=1300)), "left: nn=20. (training"),
-        (rule(replace(guessed, samples=1100)), "left: more data would bear a larger map."),
-        (rule(replace(guessed, validation=0.025)), "left: more data would bear a larger map."),
+        (rule(replace(guessed, samples=1100)), "left: more data would allow a larger map."),
+        (rule(replace(guessed, validation=0.025)), "left: more data would allow a larger map."),
         (rule(polynomial), "degree=5"),
         (rule(seen), "30.0 % of the error's power"),
     ):
