@@ -1,7 +1,7 @@
-"""Evidence on the errors of a fit, in numbers: from records, simulations and history.
+"""Evidence on the errors of a fit, in numbers from records, simulations and the fit's history.
 
 Errors are root mean squares relative to the standard deviation of the training outputs, so that
-outputs of any unit count alike.
+outputs in any unit have the same weight.
 """
 
 from __future__ import annotations
@@ -31,89 +31,92 @@ from lfrtorch.reporting.verdict import NEITHER, Kind, Verdict
 from lfrtorch.survey.signal import survey_signal
 
 NOISE_LIMITED = 1.1
-"""Training error over the noise up to which the model's own share, √(1.1² - 1), is below half of
-the noise."""
+"""Largest training error, over the noise, that counts as noise: the share of the model itself,
+√(1.1² - 1), is then below half of the noise."""
 
 SOUND = 0.8
-"""Training error over the noise below which the noise is not what it seems: a model of few
-parameters has no error below it."""
+"""Smallest training error over the noise at which the noise is credible: a model with few
+parameters has no error far below the noise."""
 
 FALLING = 0.02
-"""Part by which the error must have fallen over a tenth of the iterations, at the pace of the last
-ones, to count as still falling: as many iterations again would bring 18 % at that pace."""
+"""The error still falls if it falls by more than this part in a tenth of the iterations, at the
+pace of the last ones. At that pace, as many iterations again would lower it by 18 %."""
 
 OVERFIT = 1.5
-"""Growth from training to validation of the NL-LFR's error over that of the linear model's, which
-sees how the records differ."""
+"""Growth of the NL-LFR's error from training to validation, over the growth of the linear model's.
+The linear model's growth shows how the records differ."""
 
 USELESS = 0.9
-"""Error over the linear model's from which on the NL-LFR is hardly better."""
+"""Error over the linear model's error, above which the NL-LFR is hardly better."""
 
 UNEXPLAINED = 0.7
-"""Training error from which on half of the outputs' power has no explanation."""
+"""Training error above which half of the outputs' power is unexplained."""
 
 LINEAR = 0.25
-"""Part of the error's power that is linear in the inputs: 0.48 of Bouc-Wen at an order one too low,
-0.01 at the right one; 0.97 and 0.08 of Silverbox."""
+"""Part of the error's power that is linear in the inputs, above which states are missing. It is
+0.48 for Bouc-Wen at an order one too low, and 0.01 at the right order; 0.97 and 0.08 for
+Silverbox."""
 
 NONLINEAR = 0.1
-"""Part that squares and cubes of the outputs explain: 0.39 and 0.93 for the linear models of
-Bouc-Wen and Silverbox, 0.00 and 0.10 for good NL-LFRs."""
+"""Part of the error's power that squares and cubes of the outputs explain, above which the static
+map is too small. It is 0.39 and 0.93 for the linear models of Bouc-Wen and Silverbox, 0.00 and 0.10
+for good NL-LFRs."""
 
 EXTRAPOLATES = 1.25
-"""Largest input of a test over the largest in training, above which the model extrapolates."""
+"""Largest input of a test, over that in training, above which the model extrapolates."""
 
 AS_GUESSED = 1.25
-"""Training error over a guess of the noise up to which white residuals are noise: a guess is half
-of what the noise is, or twice that, where it is wrong."""
+"""Largest training error over the estimated noise at which white residuals count as noise. A wrong
+estimate is half or twice the noise."""
 
 _BEGINNING = 0.05  # part of a record that is its beginning
 
-_CHANCE = 0.01  # probability from which on a correlation is one by chance
+_CHANCE = 0.01  # correlations of a larger probability count as chance
 
 LAST = 5
-"""Iterations that the pace of a search is taken from, at least; of a long one the last tenth."""
+"""The pace of a search is that of at least so many iterations, in a long search of the last
+tenth."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Numbers of a fit; None if one is not known."""
+    """Numbers of a fit; None for a number that is not known."""
 
-    train: float | None  # errors on the training records, of the NL-LFR
-    linear_train: float | None  # and of the linear model
-    validation: float | None = None  # on those that chose the iterate
+    train: float | None  # error of the NL-LFR on the training records
+    linear_train: float | None  # error of the linear model on the training records
+    validation: float | None = None  # error on the records that chose the iterate
     linear_validation: float | None = None
     outputs: Mapping[str, float] = field(default_factory=dict)  # error / linear's, if several
-    parameters: int = 0  # without gauge directions
-    samples: int = 0  # scored in training
-    noise: float | None = None  # of the outputs, known or from the differences between periods
+    parameters: int = 0  # number without gauge directions
+    samples: int = 0  # scored samples in training
+    noise: float | None = None  # noise of the outputs, known or from differences between periods
     linear: float | None = None  # part of the error's power that a filter of the inputs explains
-    nonlinear: float | None = None  # that squares and cubes of the outputs explain beyond that
-    transient: float | None = None  # training error at the beginning over that in the rest
-    free: float | None = None  # part of its power there that a free response explains
-    unlike_chance: float = 0.0  # probability of so unlike linear errors in training and validation
-    risen: float = 1.0  # median validation error after the kept iterate over that of the kept one
+    nonlinear: float | None = None  # further part that squares and cubes of the outputs explain
+    transient: float | None = None  # training error at the beginning over the error in the rest
+    free: float | None = None  # part of the power at the beginning that a free response explains
+    unlike_chance: float = 0.0  # probability that linear errors in both parts differ so by chance
+    risen: float = 1.0  # median of later validation errors over that of the kept iterate
     fell: float = 1.0  # training error at the end over that of the kept iterate
-    falling: float = 0.0  # part by which the error fell lately over a tenth of the iterations
+    falling: float = 0.0  # part by which the error lately fell over a tenth of the iterations
     iterations: int = 0
-    starts: Sequence[float] = ()  # errors of all starts that went to the end, the best first
-    started: int = 1
-    continued: bool = False  # from a model, so that there are no other starts
-    sizes: Mapping[str, int] = field(default_factory=dict)  # nx is that of the linear model
-    known: bool = False  # whether a part of the model is; sizes are then those of the rest
-    searched: bool = False  # whether the data chose them
+    starts: Sequence[float] = ()  # errors of all starts that ran to the end, the best first
+    started: int = 1  # number of starts
+    continued: bool = False  # whether the fit started from a model, so without other starts
+    sizes: Mapping[str, int] = field(default_factory=dict)  # nx is the linear model's
+    known: bool = False  # whether a part of the model is known; sizes are those of the rest
+    searched: bool = False  # whether the data chose the sizes
     trainer: Any = field(default_factory=LevenbergMarquardt)
-    ridge: bool = False
+    ridge: bool = False  # whether there is a ridge
     louder: Mapping[str, float] = field(default_factory=dict)  # largest input / training's, by test
-    apart: Mapping[str, float] = field(default_factory=dict)  # deviation among starts, if a mean
-    diverged: Sequence[str] = ()  # names of records
-    test: float | None = None  # errors on all tests together
+    apart: Mapping[str, float] = field(default_factory=dict)  # standard deviation among starts
+    diverged: Sequence[str] = ()  # names of records on which the NL-LFR diverges
+    test: float | None = None  # error on all tests together
     linear_test: float | None = None
-    guess: float | None = None  # of the noise, from the spectra; where it is not known
-    white: bool = False  # whether the residuals are, and depend on no input
+    guess: float | None = None  # noise estimated from the spectra, if it is not known
+    white: bool = False  # whether the residuals are white and independent of the inputs
     spent: bool = False  # whether the limit ended every start, and the last iterate was kept
-    settled: bool = False  # whether all that was held out has settled
-    verdict: Verdict | None = None  # which advice must agree with
+    settled: bool = False  # whether all records that were held out have settled
+    verdict: Verdict | None = None  # advice must agree with it
 
     @property
     def better(self) -> bool:
@@ -127,14 +130,14 @@ class Evidence:
 
     @property
     def judged(self) -> tuple[float | None, float | None, str]:
-        """Errors of the NL-LFR and the linear model on validation, else on training; and which."""
+        """Errors of the NL-LFR and the linear model on validation or in training, and its name."""
         if self.validation is None:
             return self.train, self.linear_train, "training"
         return self.validation, self.linear_validation, "validation"
 
     @property
     def gain(self) -> float | None:
-        """The NL-LFR's error over the linear model's, as judged; 0 without the latter."""
+        """The NL-LFR's error over the linear model's, as ``judged``; 0 without a linear error."""
         error, linear_error, _ = self.judged
         if error is None:
             return None
@@ -142,12 +145,12 @@ class Evidence:
 
     @property
     def behind(self) -> dict[str, float]:
-        """Outputs that gain nothing over the linear model."""
+        """Outputs on which the NL-LFR is hardly better than the linear model, and the ratios."""
         return {name: ratio for name, ratio in self.outputs.items() if ratio > USELESS}
 
     @property
     def nx(self) -> int:
-        """States of the linear model, of a known one those beside it."""
+        """States of the linear model; with a known part, the states besides it."""
         return self.sizes.get("nx", 0)
 
     @property
@@ -158,7 +161,7 @@ class Evidence:
 
     @property
     def linear_over_noise(self) -> float:
-        """The linear model's error in training over the noise; infinite if it is not known."""
+        """The linear model's error in training over the noise; infinite if one is not known."""
         return self.linear_train / self.noise if self.linear_train and self.noise else math.inf
 
     @property
@@ -168,14 +171,14 @@ class Evidence:
 
     @property
     def unexplained(self) -> bool:
-        """True if neither model explains the training outputs, nor would one with more states."""
+        """True if neither model explains the training outputs, and more states would not help."""
         if not self.neither or self.train is None or not self.linear_train:
             return False
         return min(self.train, self.linear_train) > UNEXPLAINED and not self.states_missing
 
     @property
     def lost_on_tests(self) -> bool:
-        """True if the gain over the linear model is absent in the tests."""
+        """True if there is a gain over the linear model, but not on the tests."""
         if self.tests is None or self.gain is None or self.useless or self.better:
             return False
         return self.tests > USELESS
@@ -187,8 +190,8 @@ class Evidence:
 
     @property
     def growths(self) -> dict[str, float]:
-        """Growth of the error from training to other parts over that of the linear model."""
-        # What grows for the linear model as well lies in the records, and louder tests extrapolate.
+        """Growth of the error from training to other parts, over the linear model's growth."""
+        # If the linear model's error grows too, the records differ. Louder tests extrapolate.
         parts = {"validation": (self.validation, self.linear_validation)}
         if not self.settled and all(ratio <= EXTRAPOLATES for ratio in self.louder.values()):
             parts["test"] = self.test, self.linear_test
@@ -200,27 +203,27 @@ class Evidence:
 
     @property
     def overfit(self) -> float | None:
-        """The largest of these growths."""
+        """The largest of ``growths``."""
         return max(self.growths.values(), default=None)
 
     @property
     def overtrained(self) -> bool:
-        """True if validation rose after the kept iterate, while training fitted noise."""
-        # Training error falls while validation rises.
+        """True if validation rose after the kept iterate, while the training error fell."""
+        # With few samples a parameter, training then fits noise.
         crowded = not (self.bears(1.0) or self.states_missing)
         return crowded and self.risen >= 1.05 and self.fell <= 0.99
 
     def bears(self, growth: float) -> bool:
         """Tell if the samples suffice for ``growth`` times the parameters."""
-        # With ten samples a parameter, p/M = 0.1, fitted white noise is √((1 + p/M) / (1 - p/M)) =
-        # 1.1 times as large on other samples. If there are more, the map is too small instead: with
-        # 11 and 21 a larger one was the better on the coupled drives and the tanks. A larger map
-        # with more is advised, so that the next fit's advice does not ask for a smaller one.
+        # With ten samples a parameter, p/M = 0.1, the error is √((1 + p/M) / (1 - p/M)) = 1.1 times
+        # as large on other samples, if the model fits white noise. With more samples a parameter,
+        # the map is rather too small: with 11 and 21 a larger map was better on the coupled drives
+        # and the tanks. So a larger map must leave more than ten, or the next fit would overfit.
         return self.samples > 10 * growth * self.parameters
 
     @property
     def noise_limited(self) -> bool:
-        """True if the training error is noise, the search at its end, and validation agrees."""
+        """True if the training error is noise, the search has converged, and validation agrees."""
         if not self.noise or self.train is None or self.falling > FALLING:
             return False
         if not SOUND * self.noise <= self.train <= NOISE_LIMITED * self.noise:
@@ -229,7 +232,7 @@ class Evidence:
 
     @property
     def nothing_left(self) -> bool:
-        """Tell whether the residuals are white, and as large as the noise seems to be."""
+        """Tell whether the residuals are white, and about as large as the estimated noise."""
         if not self.guess or not self.white or self.train is None or self.noise:
             return False
         if self.falling > FALLING or (self.overfit or 0.0) > OVERFIT:
@@ -238,12 +241,12 @@ class Evidence:
 
     @property
     def states_missing(self) -> bool:
-        """True if the error has a part that is linear in the inputs."""
+        """True if a large part of the error is linear in the inputs."""
         return (self.linear or 0.0) > LINEAR
 
     @property
     def structured(self) -> bool:
-        """True if the training error has a part that noise does not have."""
+        """True if a part of the training error is not noise: it follows from inputs or outputs."""
         return self.states_missing or (self.nonlinear or 0.0) > NONLINEAR
 
     @property
@@ -256,7 +259,7 @@ class Evidence:
 
     @property
     def proven(self) -> bool:
-        """True if every step kept a proof, so that no sizes or ridge can be chosen."""
+        """True if the trainer keeps a proof in every step: then no sizes or ridge can be chosen."""
         return getattr(self.trainer, "guarantee", None) not in (None, "stable")
 
     @property
@@ -269,16 +272,16 @@ def evidence(
     result: FitResult,
     responses: Sequence[Response],
     *,
-    bla: LinearModel | None = None,  # whose free responses tell a wrong start
-    noise_rms: float | None = None,  # of the training outputs in their unit, if it is known
-    continued: bool = False,  # from a model
-    ridge: bool = False,
-    searched: bool = False,  # whether the sizes were chosen by the data
-    trainer: Trainer | None = None,  # Levenberg-Marquardt if not given
+    bla: LinearModel | None = None,  # its free responses reveal a wrong start
+    noise_rms: float | None = None,  # noise of the training outputs in their unit, if it is known
+    continued: bool = False,  # whether the fit started from a model
+    ridge: bool = False,  # whether there is a ridge
+    searched: bool = False,  # whether the data chose the sizes
+    trainer: Trainer | None = None,  # default: Levenberg-Marquardt
     verdict: Verdict | None = None,
     residuals: Residuals | None = None,
 ) -> Evidence:
-    """Measure what advice rests on; the responses are of all records."""
+    """Compute the numbers behind advice, from the responses of all records."""
     train, validation, tests = (
         [response for response in responses if response.use == use]
         for use in ("train", "validation", "test")
@@ -291,7 +294,7 @@ def evidence(
         noise = np.full(len(scale), noise_rms)
     linear, nonlinear = explained_parts(train)
     if any(response.record.start == "measured" for response in train):
-        linear = None  # its states are the outputs, and can be no others
+        linear = None  # the states are the outputs, so none can be missing
     here, there = ([r.linear_error / scale for r in part] for part in (train, validation))
     risen, fell = after_kept(result)
     peak = _peak(train, result.model.scaler.u_offset)
@@ -351,7 +354,7 @@ def evidence(
 
 
 def _guess(train: Sequence[Record], scale: Array) -> float | None:
-    """The noise that preview guesses of the longest record, over the scale; None if of no guess."""
+    """The noise that preview estimates in the longest record, over the scale; None if it cannot."""
     record = max(train, key=lambda record: record.samples)
     y, u = record.y[record.skip :], record.u[record.skip :]
     if record.valid is not None or not len(y):
@@ -365,7 +368,7 @@ def _guess(train: Sequence[Record], scale: Array) -> float | None:
 
 
 def _apart(result: FitResult, response: Response, scale: Array) -> float:
-    """Deviation of the outputs of the starts that a mean is of, over the scale; 0 if it is none."""
+    """Standard deviation of the outputs among the starts of a mean, over the scale; 0 without."""
     if not result.members:
         return 0.0
     outputs = [model.simulate(response.record) for model in result.members]
@@ -373,9 +376,9 @@ def _apart(result: FitResult, response: Response, scale: Array) -> float:
 
 
 def falling(result: FitResult) -> float:
-    """Part by which the judging error fell over a tenth of the iterations, at the last pace."""
-    # The pace is that of the last tenth, five iterations at least; 0 unless the limit ended the
-    # search.
+    """Part by which the judging error falls in a tenth of the iterations, at the last pace."""
+    # The pace is that of the last tenth, but of at least five iterations. The part is 0 unless the
+    # limit ended the search.
     history = result.history
     iterations = len(history) - 1
     if result.reason not in SPENT or not iterations:
@@ -390,8 +393,8 @@ def falling(result: FitResult) -> float:
 
 
 def after_kept(result: FitResult) -> tuple[float, float]:
-    """Errors after the kept iterate over its own: median of validation, last of training."""
-    # 1 and 1 if validation did not choose, or if fewer than five iterations follow.
+    """Median of the later validation errors, and last training error, over the kept iterate's."""
+    # Both are 1 if validation did not choose, or if fewer than five iterations follow.
     if not result.history:
         return 1.0, 1.0
     kept, *later = result.history[result.chosen_iteration :]
@@ -402,10 +405,11 @@ def after_kept(result: FitResult) -> tuple[float, float]:
 
 
 def chance_of_ratio(here: Sequence[Array], there: Sequence[Array]) -> float:
-    """Probability that errors of one size differ by as much in power as these do, or by more."""
-    # An F test with the degrees of freedom that ten blocks of time show, of the side that varies
-    # more (Satterthwaite, Biometrics Bulletin 2(6), 1946): slow errors, or a few large ones, are
-    # few. 1 if one side has fewer samples than blocks, or no error.
+    """Probability that errors of the same size differ in power at least as much as these do."""
+    # This is an F test. Its degrees of freedom follow from the scatter over ten blocks of time, on
+    # the side that varies more (Satterthwaite, Biometrics Bulletin 2(6), 1946): slow errors, or a
+    # few large errors, have few. The result is 1 if a side has fewer samples than blocks, or no
+    # error.
     powers, samples, spread = [], [], 0.0
     for errors in (here, there):
         squares = [np.mean(error**2, axis=1) for error in errors]
@@ -418,7 +422,7 @@ def chance_of_ratio(here: Sequence[Array], there: Sequence[Array]) -> float:
             return 1.0
         powers.append(power)
         samples.append(counts.sum())
-        spread = max(spread, counts.sum() * float(error / power) ** 2)  # of one sample
+        spread = max(spread, counts.sum() * float(error / power) ** 2)  # variance of one sample
     high, low = np.argsort(powers)[::-1]
     freedom = 2.0 * np.array(samples) / max(spread, np.finfo(float).tiny)
     one_side = fdtrc(freedom[high], freedom[low], powers[high] / powers[low])
@@ -448,9 +452,9 @@ def _by_output(responses: Sequence[Response]) -> dict[str, float]:
 def _transient(
     train: Sequence[Response], scale: Array, bla: LinearModel
 ) -> tuple[float | None, float | None]:
-    """Error at the beginning over the rest, and the part that free responses explain."""
-    # States of the linear model are fitted to the beginning's first half, and are to be right in
-    # the second, too. None if the starts are known or fitted.
+    """Error at the beginning over the rest, and the part of it that free responses explain."""
+    # States of the linear model are fitted to the first half of the beginning, and judged on all of
+    # the beginning. The result is None if the starts are known or fitted.
     first, rest, left = [], [], []
     for response in train:
         if response.record.start in ("periodic", "estimated"):
@@ -483,12 +487,12 @@ def _transient(
 
 
 def _peak(responses: Sequence[Response], offset: Array) -> Array:
-    """Largest deviation (nu,) of the inputs from the operating point."""
+    """Largest distance (nu,) of the inputs from the operating point."""
     return np.max([np.abs(r.record.u - offset).max(axis=0) for r in responses], axis=0)
 
 
 def _finished(result: FitResult) -> list[float]:
-    """Errors of the starts that went to the end, on validation if there is one."""
+    """Sorted errors of the starts that ran to the end, on validation if there is one."""
     found = [
         start.train if math.isnan(start.validation) else start.validation
         for start in result.starts

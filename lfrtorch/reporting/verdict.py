@@ -1,18 +1,21 @@
 """The verdict on a fit: is the NL-LFR better than the linear model on what was not fitted?
 
-The models share a record's noise, so what tells them apart is the ratio of their errors over the
-same blocks of time, and the standard error of its logarithm. (That of the difference is large if a
-few resonances have most of the error, even where one model is better in every block.) A ratio is
-clear if it is beyond Student's quantile, or if one error is twice the other: one burst of a model
-that runs away has a large standard error, and is no chance. A difference below 5 % of the error is
-none. Parts left out in turn are the whole record, each stretch judged by models that were chosen
-without it: there 2.25 standard errors and 1 % are enough (``benchmarks/first_try.md``). There one
-stretch in which a model runs away may have most of the error. It neither hides nor makes a verdict:
-the mean of the blocks' own log ratios, each of a factor 3 at most, has to point the same way, and
-is enough by itself if it is below 0.85 and 2 standard errors below 1.
+Both models see the same noise of a record. So they are compared by the ratio of their errors over
+the same blocks of time, and by the standard error of its logarithm. (The standard error of the
+difference is large if a few resonances make up most of the error, even if one model is better in
+every block.) A ratio is clear if its logarithm is beyond Student's quantile, or if one error is
+twice the other: a burst in which one model runs away has a large standard error, but is not chance.
+Differences below 5 % do not count.
 
-A part in which inputs and outputs stand still, as the end of a step test, tells the gain alone. It
-can show that a model is worse, and not that it is better: that is said of the parts that move.
+In cross-validation the whole record is left out in turn, and each stretch is judged by models that
+were chosen without it. There, 2.25 standard errors and 1 % are enough
+(``benchmarks/first_try.md``). One stretch in which a model runs away may have most of the error,
+but must not decide. So the mean log ratio of the blocks, with each ratio limited to a factor of 3,
+has to point the same way. This mean is enough by itself if it stands for a ratio below 0.85 and is
+2 standard errors below 0.
+
+A part in which inputs and outputs stand still, such as the end of a step test, shows only the
+static gain. It can show that a model is worse, but not that it is better: only parts that move can.
 """
 
 from __future__ import annotations
@@ -35,32 +38,34 @@ from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.reporting.evaluation import CROSS, Response, has_settled, training_deviations
 
 NL_LFR = "NL-LFR"
-"""Verdict to use the NL-LFR."""
+"""Value of ``use`` that recommends the NL-LFR."""
 
 LINEAR_MODEL = "linear model"
-"""Verdict to use the linear model."""
+"""Value of ``use`` that recommends the linear model."""
 
 NEITHER = "neither"
-"""Verdict to use neither model."""
+"""Value of ``use`` that recommends neither model."""
 
 SAME = 0.05
 """Difference of the errors, relative to the linear model's, below which neither is preferred."""
 
-_CROSS_SAME, _CROSS_CLEAR = 0.01, 2.25  # likewise, and the standard errors, in cross-validation
-_TYPICAL, _TYPICAL_CLEAR = 0.85, 2.0  # likewise, of the mean log ratio of the blocks
-_MOST = 3.0  # ratio of a block that counts, and its inverse
-_CROSS_BLOCKS = 16  # of a record: four in each stretch
-_LEAST_ERROR = 1e-3  # of that mean: blocks may all have the same ratio
+# SAME in cross-validation, and the standard errors by which a log ratio is clear there.
+_CROSS_SAME, _CROSS_CLEAR = 0.01, 2.25
+_TYPICAL, _TYPICAL_CLEAR = 0.85, 2.0  # mean ratio of the blocks that is enough, standard errors
+_MOST = 3.0  # ratios of blocks are limited to this factor and its inverse
+_CROSS_BLOCKS = 16  # blocks of a record in cross-validation: four in each stretch
+_LEAST_ERROR = 1e-3  # smallest standard error of the mean log ratio: all blocks may be alike
 
-_CLEAR = 2.0  # ratio of two errors that is no chance, whatever its standard error
+_CLEAR = 2.0  # ratio of two errors that is not chance, whatever its standard error
 
 CONFIDENCE = 0.975
-"""Probability of the quantile that a difference must exceed, one-sided; the rest is divided among
-the records that are compared one by one."""
+"""One-sided probability of the quantile that a log ratio must exceed. If records are compared one
+by one, the remaining 0.025 are divided among them."""
 
 EXPLAINS_NOTHING = 0.9
-"""Error over the output's standard deviation from which on a model is of no use. The deviation is
-that of the record, or of the training records if it is larger: a record may have settled."""
+"""Error over the output's standard deviation from which on a model is of no use. The standard
+deviation is that of the record, or of the training records if it is larger there: a record may have
+settled."""
 
 
 _LONGEST_NAME = 28  # characters of a record's name in a sentence
@@ -72,29 +77,29 @@ class Kind(StrEnum):
     BETTER = "better"
     """The NL-LFR is clearly better than the linear model on records that were not fitted."""
     LINEAR = "linear"
-    """It is not: the linear model does as well."""
+    """The NL-LFR is not clearly better: the linear model does as well."""
     WORSE = "worse"
-    """It is clearly worse on one of these records at least."""
+    """The NL-LFR is clearly worse on at least one of these records."""
     DIVERGES = "diverges"
-    """Its simulation runs away on a record, or the search failed."""
+    """The simulation of the NL-LFR runs away on a record, or the search failed."""
     UNJUDGED = "unjudged"
-    """Nothing was held out that moves: the training error is known, or the gain."""
+    """No record that moves was held out: only the training error, or the static gain, is known."""
 
 
 class Comparison(NamedTuple):
-    """The NL-LFR beside the linear model on one record or several, each output counting alike."""
+    """Errors of both models on one or several records, with the same weight for each output."""
 
-    name: str  # in a sentence, such as "test 'sweep'"
-    ratio: float  # of their errors
-    ratio_std: float  # its standard error
-    deviations: float  # of the logarithm of the ratio from 0, in standard errors
-    clear: float  # how many are needed
-    nrmse: float  # error over the output's standard deviation
-    linear_nrmse: float
-    same: float = SAME  # difference of the errors that is none
-    cross: bool = False  # whether each stretch has models of its own
-    middle: float = 1.0  # mean ratio of the blocks, geometric, each between 1/3 and 3
-    typical: bool = False  # whether it is clearly smaller in most blocks of cross-validation
+    name: str  # name of the records in a sentence, such as "test 'sweep'"
+    ratio: float  # error of the NL-LFR over the error of the linear model
+    ratio_std: float  # standard error of the ratio
+    deviations: float  # logarithm of the ratio, in standard errors
+    clear: float  # standard errors from which on the ratio is clear
+    nrmse: float  # error of the NL-LFR over the output's standard deviation
+    linear_nrmse: float  # the same for the linear model
+    same: float = SAME  # relative differences below this do not count
+    cross: bool = False  # whether these are errors of cross-validation
+    middle: float = 1.0  # geometric mean of the blocks' ratios, each limited to 1/3 .. 3
+    typical: bool = False  # whether ``middle`` is clearly small, in cross-validation
 
     @property
     def worse(self) -> bool:
@@ -107,17 +112,17 @@ class Comparison(NamedTuple):
         """True if the NL-LFR's error is clearly smaller."""
         certain = self.deviations < -self.clear or self.ratio <= 1.0 / _CLEAR
         whole = certain and self.ratio < 1.0 - self.same
-        # In cross-validation the runaway of one model in one stretch decides nothing.
+        # In cross-validation, one stretch in which a model runs away does not decide.
         return self.typical or (whole and not (self.cross and self.middle >= 1.0))
 
     @property
     def hidden(self) -> bool:
-        """Tell whether a runaway in one stretch hides what is so in most blocks."""
+        """Tell whether a runaway in one stretch hides that most blocks are better."""
         return self.typical and not self.ratio < 1.0 - self.same
 
     @property
     def told(self) -> float:
-        """The ratio to speak of: that of the blocks if a runaway hides it."""
+        """The ratio for the sentence: ``middle`` if a runaway hides the gain."""
         return self.middle if self.hidden else self.ratio
 
     def entry(self) -> dict[str, Any]:
@@ -130,10 +135,10 @@ class Comparison(NamedTuple):
 class Comparisons:
     """Comparisons that a verdict rests on."""
 
-    whole: Comparison | None = None  # all records that judge
-    records: Sequence[Comparison] = ()  # each that was not fitted
-    diverges: Sequence[str] = ()  # records on which the NL-LFR runs away
-    ahead: Mapping[int, Comparisons] = field(default_factory=dict)  # of predictions farther ahead
+    whole: Comparison | None = None  # comparison on all records that judge
+    records: Sequence[Comparison] = ()  # comparison on each record that was not fitted
+    diverges: Sequence[str] = ()  # names of records on which the NL-LFR runs away
+    ahead: Mapping[int, Comparisons] = field(default_factory=dict)  # by the samples ahead
 
     def entry(self) -> dict[str, Any]:
         """For ``metrics.json``."""
@@ -147,14 +152,14 @@ class Comparisons:
 class Verdict:
     """Comparison of the NL-LFR with the linear model."""
 
-    kind: Kind  # what it comes to
-    text: str  # in a sentence of 160 characters at most
-    use: str  # "NL-LFR", "linear model" or "neither"
+    kind: Kind
+    text: str  # the verdict as a sentence of at most 160 characters
+    use: str  # the model to use: "NL-LFR", "linear model" or "neither"
     evidence: Comparisons = field(default_factory=Comparisons)
 
     @property
     def colour(self) -> str:
-        """``"red"`` if bad, ``"amber"`` if linear, ``"green"`` if better, ``"grey"`` if unknown."""
+        """``"red"`` if bad, ``"amber"`` if linear, ``"green"`` if better, else ``"grey"``."""
         if self.use == NEITHER or self.kind in (Kind.WORSE, Kind.DIVERGES):
             return "red"
         return {Kind.BETTER: "green", Kind.LINEAR: "amber"}.get(self.kind, "grey")
@@ -168,39 +173,39 @@ class Verdict:
 
 
 class Refusal(NamedTuple):
-    """A reason not to call an NL-LFR better whose error is smaller."""
+    """A reason not to call an NL-LFR better although its error is smaller."""
 
-    text: str  # in a sentence after "the error is 67 % of its, but", in 42 characters at most
-    kind: Kind = Kind.WORSE  # what the verdict comes to
+    text: str  # at most 42 characters, after "the error is 67 % of its, but"
+    kind: Kind = Kind.WORSE  # kind of the verdict
 
 
 REMEMBERS = Refusal("it does not forget where it began", Kind.LINEAR)
-"""Refusal of a model whose output depends for ever on its start, unlike the records."""
+"""Refusal of a model whose output always depends on its start, unlike the system's."""
 
 
 class _Errors(NamedTuple):
     """Relative squared errors of a record, summed over each block of time (B,)."""
 
     response: Response
-    squares: Array
-    linear: Array
-    counts: Integers
-    power: float
-    settled: bool  # whether it tells the gain alone
+    squares: Array  # of the NL-LFR
+    linear: Array  # of the linear model
+    counts: Integers  # samples of each block
+    power: float  # mean square of the outputs, each without its mean and over its scale
+    settled: bool  # whether the record has settled, so that it shows only the static gain
 
 
 class _Case(NamedTuple):
-    """Numbers that the rules of a verdict look at."""
+    """Numbers that the rules of a verdict use."""
 
     result: FitResult
-    lost: Sequence[Response]  # on which the NL-LFR diverges
-    whole: Comparison | None  # on all records that judge
-    worst: Comparison | None  # on the record where it is clearly worse
+    lost: Sequence[Response]  # records on which the NL-LFR diverges
+    whole: Comparison | None  # comparison on all records that judge
+    worst: Comparison | None  # comparison on the record where it is worst, if clearly worse
     held_out: bool  # whether the records that judge were not fitted
-    settled: str  # tests that have settled, in words, if others judge or none does
-    moves: bool  # whether the records that judge do
-    nx: int  # of the linear model
-    error: str  # what is compared
+    settled: str  # names of tests that have settled, if no test moves
+    moves: bool  # whether a record that judges moves
+    nx: int  # order of the linear model
+    error: str  # name of the error that is compared
     refusals: Sequence[Refusal]
 
     @property
@@ -209,7 +214,7 @@ class _Case(NamedTuple):
         return f"the linear model (nx {self.nx})"
 
 
-_Found = tuple[Kind, str, str]  # what a verdict comes to, what is to be used, and the sentence
+_Found = tuple[Kind, str, str]  # kind of the verdict, the model to use, and the sentence
 
 
 def judge(
@@ -222,9 +227,10 @@ def judge(
 ) -> Verdict:
     """Judge a fit by the errors on all records.
 
-    Every record that was not fitted is looked at: one on which the NL-LFR is clearly worse is
-    enough. It is better if it is so on the tests together, without tests that move on validation,
-    and if nothing refuses that. Records of fewer than ten scored samples say nothing.
+    If the NL-LFR is clearly worse on any record that was not fitted, the verdict is "worse". The
+    NL-LFR is better if it is clearly better on all tests together and no refusal applies. If no
+    test moves, validation takes the place of the tests. Records with fewer than ten scored samples
+    do not count.
 
     """
     lost = [r for r in responses if not np.isfinite(rms(r.error))]
@@ -262,16 +268,16 @@ def judge(
         if used >= EXPLAINS_NOTHING:
             use = NEITHER
             text = (
-                f"Neither model is usable: on {whole.name} the errors are {percent(whole.nrmse)} "
+                f"Neither model is usable: on {whole.name} errors are {percent(whole.nrmse)} "
                 f"(NL-LFR) and {percent(whole.linear_nrmse)} (linear, nx {linear_nx}) of the "
-                "output's deviation"
+                "output's standard deviation"
             )
     advice = "; use the linear model" if use == LINEAR_MODEL else ""
     return Verdict(kind, f"{text}{advice}.", use, evidence)
 
 
 def _unusable(c: _Case) -> _Found | None:
-    """A model that runs away, that was not found, or that is clearly worse on some record."""
+    """The verdict if the NL-LFR runs away, was not trained, or is clearly worse on a record."""
     lost = f"The NL-LFR diverges on {_names(c.lost)}" if c.lost else ""
     if lost and all(nrmse(r.record, r.y_linear) >= EXPLAINS_NOTHING for r in c.lost):
         nothing = f", where {c.linear} explains nothing, either: neither is usable"
@@ -289,7 +295,7 @@ def _unusable(c: _Case) -> _Found | None:
 
 
 def _unjudged(c: _Case) -> _Found | None:
-    """Nothing held out that is long enough, or that moves."""
+    """The verdict if no record that is held out is long enough, or moves."""
     if c.whole is None:
         return Kind.UNJUDGED, NL_LFR, f"Not judged: no record has {BLOCKS} samples"
     if not c.held_out:
@@ -297,13 +303,13 @@ def _unjudged(c: _Case) -> _Found | None:
         use = NL_LFR if c.whole.ratio < 1.0 - SAME else LINEAR_MODEL
         return Kind.UNJUDGED, use, f"Not judged (nothing held out): {on}"
     if not c.moves:
-        settled = f"{c.settled} settled and tells the gain alone"
-        return Kind.UNJUDGED, LINEAR_MODEL, f"Not decided beside {c.linear}: {settled}"
+        settled = f"{c.settled} settled and shows only the static gain"
+        return Kind.UNJUDGED, LINEAR_MODEL, f"Not judged against {c.linear}: {settled}"
     return None
 
 
 def _judged(c: _Case, whole: Comparison) -> _Found:
-    """A comparison on what was held out."""
+    """The verdict by the comparison on the records that were held out."""
     told = f"{percent(whole.told)} of its"
     on = f"on {whole.name} the"
     if whole.better and c.refusals:
@@ -316,7 +322,7 @@ def _judged(c: _Case, whole: Comparison) -> _Found:
         most = "in most blocks " * whole.hidden
         text = f"Better than {c.linear}{constant}: {on} NL-LFR's {c.error} is {most}{told}{still}"
         return Kind.BETTER, NL_LFR, text
-    # Difference that three digits do not show, its standard error included.
+    # Three digits show neither the difference nor its standard error.
     if abs(whole.ratio - 1.0) + whole.ratio_std < 5e-4:
         kept = "the fit kept its start, and " * (c.result.chosen_iteration == 0)
         return Kind.LINEAR, LINEAR_MODEL, f"As {c.linear}: {kept}{on} errors are the same"
@@ -333,10 +339,10 @@ def judge_predictions(
     linear_nx: int,
     refusals: Sequence[Refusal] = (),
 ) -> Verdict:
-    """Judge a fit by predictions so many samples ahead, the fewest first.
+    """Judge a fit by predictions; ``views`` are keyed by the samples ahead, the fewest first.
 
-    A small error one sample ahead is no merit of a model that is worse farther ahead. Sensor noise
-    may be all that both models leave there: then it is better if it is so farther ahead.
+    A model with a small error one sample ahead is not better if it is worse farther ahead. If both
+    models leave only sensor noise one sample ahead, the errors farther ahead decide.
 
     """
     farther = {
@@ -375,7 +381,7 @@ def judge_predictions(
 
 
 def _farther(ahead: int, verdict: Verdict) -> Refusal | None:
-    """Return what a verdict farther ahead refuses; None where neither model foresees anything."""
+    """The refusal that follows from a verdict farther ahead; None if both models fail there."""
     whole = verdict.evidence.whole
     ratio = math.inf if whole is None else whole.ratio
     worse = verdict.kind == Kind.WORSE and (verdict.use != NEITHER or ratio >= _CLEAR)
@@ -389,13 +395,13 @@ class LinearVerdict(NamedTuple):
 
     usable: bool | None  # None if nothing is scored
     text: str
-    on: str | None = None  # the use of the records that judge
-    output: str | None = None  # the worst one
-    nrmse: float | None = None  # its error over its standard deviation
+    on: str | None = None  # use of the records that judge
+    output: str | None = None  # name of the output with the largest error
+    nrmse: float | None = None  # error of this output over its standard deviation
 
 
 def judge_linear(responses: Sequence[Response]) -> LinearVerdict:
-    """Judge a linear model by its worst output on the tests, else validation, else training."""
+    """Judge a linear model by its worst output on the tests, or on validation, or in training."""
     uses = "test", "validation", "train"
     parts = {use: [r for r in responses if r.use == use] for use in uses}
     errors = {use: _relative_errors(part, responses) for use, part in parts.items()}
@@ -417,12 +423,12 @@ def judge_linear(responses: Sequence[Response]) -> LinearVerdict:
         text += f" (in training {percent(fitted_error)})"
     deviations = training_deviations(responses)
     if usable and judged != "train" and all(has_settled(r, deviations) for r in parts[judged]):
-        text += f"; {where} has settled and tells the gain alone"
+        text += f"; {where} has settled and shows only the static gain"
     return LinearVerdict(usable, f"{text[0].upper()}{text[1:]}.", judged, name, error)
 
 
 def _relative_errors(part: Sequence[Response], every: Sequence[Response]) -> dict[str, float]:
-    """Each output's error over its standard deviation, all records of a part together."""
+    """Each output's error over its standard deviation, on all records of a part together."""
     _, common = training_deviations(every)
     powers: dict[str, Array] = {}
     for s in (response.score for response in part):
@@ -443,7 +449,7 @@ def of_linear(ratio: float) -> str:
 
 
 def _errors(responses: Sequence[Response], every: Sequence[Response]) -> list[_Errors]:
-    """The squared errors of the records that are long enough, each output over its deviation."""
+    """Squared errors of all records that are long enough, each output over its scale."""
     if not every:
         return []
     u, y = training_deviations(every)
@@ -474,12 +480,12 @@ def _errors(responses: Sequence[Response], every: Sequence[Response]) -> list[_E
 
 def _compared(
     errors: Sequence[_Errors],
-    among: int = 1,  # records that are compared one by one
+    among: int = 1,  # number of records that are compared one by one
 ) -> Comparison:
-    """Both models on some records, each relative to the linear model's error there."""
+    """Compare both models on records; errors are relative to the linear model's on each record."""
     counts = np.concatenate([e.counts for e in errors])
     samples = np.array([e.counts.sum() for e in errors])
-    # A record on which the linear model is exact, as one in which nothing happens, has no scale.
+    # If the linear model has no error on a record, such as one without motion, the scale is 1.
     levels = np.array([e.linear.sum() for e in errors]) / samples
     levels = np.where(levels > 0, levels, 1.0)
     squares, linear = (
@@ -510,17 +516,17 @@ def _compared(
 
 
 def _is_cross(response: Response) -> bool:
-    """Tell whether it is of cross-validation, each stretch by other models."""
+    """Tell whether a response is that of cross-validation, with other models in each stretch."""
     return response.record.name.endswith(CROSS)
 
 
 def _use(response: Response) -> str:
-    """Use of a record, for a sentence."""
+    """The use of a record in a sentence."""
     return "training" if response.use == "train" else response.use
 
 
 def _name(response: Response) -> str:
-    """A record in a sentence."""
+    """The name of a record in a sentence."""
     name, use = response.record.name, _use(response)
     if name == CROSS:
         return name
@@ -530,6 +536,6 @@ def _name(response: Response) -> str:
 
 
 def _names(responses: Sequence[Response]) -> str:
-    """The first of several records, and how many more there are."""
+    """The name of the first of several records, and the number of the others."""
     more = f" and {len(responses) - 1} more" if len(responses) > 1 else ""
     return f"{_name(responses[0])}{more}"

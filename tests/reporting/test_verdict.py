@@ -239,7 +239,7 @@ def settled(use: str, part: float, *, noise: float = 0.01, name: str = "") -> Re
 def test_a_test_that_has_settled_shows_no_better_model():
     found = judge(result(), [TRAIN, settled("test", 0.1)])
     assert (found.kind, found.use, found.colour) == ("unjudged", "linear model", "grey")
-    assert "test settled and tells the gain alone; use the linear model" in found.text
+    assert "test settled and shows only the static gain; use the linear model" in found.text
     # Other parts that move decide in its place.
     moving = judge(result(), [TRAIN, response("validation", 0.5), settled("test", 0.1)])
     assert (moving.kind, moving.use) == ("better", "NL-LFR")
@@ -326,4 +326,4 @@ def test_a_linear_model_of_a_step_is_usable():
     found = verdict.judge_linear([TRAIN, settled("test", 1.0)])
     assert found.usable
     assert found.nrmse == pytest.approx(0.01, rel=0.1)
-    assert found.text.endswith("; test has settled and tells the gain alone.")
+    assert found.text.endswith("; test has settled and shows only the static gain.")
