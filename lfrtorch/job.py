@@ -1,4 +1,4 @@
-"""The whole job: records -> linear model -> sizes -> starts -> fit -> scores and advice."""
+"""The whole identification: records, linear model, sizes, starts, fit, scores and advice."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scored_run import scored_run
 
 _CUT = 0.2, 0.2
-"""Parts of a record for validation and test."""
+"""Fractions of a record for validation and test."""
 
 
 @typed("dataset")
@@ -41,24 +41,23 @@ def identify(
     """Identify a nonlinear LFR model, from records to scores.
 
     Args:
-        dataset: records by use. One record, or several, are cut in time as a file is: the first
-            0.6 of each for the fit, 0.2 that choose the iterate, and the last 0.2 as a test.
+        dataset: records by use. Or one or several records, each cut in time: the first 60 % are
+            fitted, the next 20 % choose the iterate, and the last 20 % are the test.
         settings: sizes, starts and trainer.
-        observer: object that is told of every step. Default: a live line, which shows
-            how far it is. :class:`lfrtorch.reporting.Console` prints every step,
-            :class:`Observer` nothing.
-        snapshots: where the starts are kept, for a program that goes on with them.
+        observer: object whose methods are called at every step. Default: it shows a progress line.
+            :class:`lfrtorch.reporting.Console` prints every step, :class:`Observer` prints nothing.
+        snapshots: store of the state of the starts, from which a later program continues.
         ranks: processes that share the starts or the training records, see :func:`lfrtorch.fit`.
-        stop: asked before each iteration; the fit ends there if it returns True, and the best
-            iterate so far is kept.
+        stop: function that is called before each iteration; if it returns True, the fit ends and
+            keeps the best iterate so far.
 
     Returns:
-        The models, their scores and all that was chosen on the way. If the fit was interrupted, or
-        a process was lost, it is that of the best iterate so far, and ``run.fit.reason`` says so.
+        The models, their scores and the numbers that were chosen. If the fit was interrupted, or a
+        process was lost, the model is the best iterate so far, and ``run.fit.reason`` says so.
 
     Raises:
-        ValueError: settings or records that do not fit together.
-        StoppedError: by ``stop`` or Ctrl-C during the search for sizes.
+        ValueError: settings or records do not fit together.
+        StoppedError: ``stop`` or Ctrl-C ended the search for sizes.
         ProcessLostError: one of the processes was lost before the fit itself.
 
     Example:
@@ -98,7 +97,7 @@ def identify(
 
 
 def _by_use(given: Any) -> Dataset:
-    """A dataset as it is, or of records each cut in time."""
+    """The dataset as it is; from records, a dataset of their parts, each record cut in time."""
     if isinstance(given, Dataset):
         return given
     records = [given] if isinstance(given, Record) else given
@@ -107,7 +106,7 @@ def _by_use(given: Any) -> Dataset:
         or not records
         or not all(isinstance(record, Record) for record in records)
     ):
-        means = "; lfrtorch.load_records(df, inputs=..., outputs=...) makes one of a frame"
+        means = "; lfrtorch.load_records(df, inputs=..., outputs=...) makes a Dataset"
         raise InputError(
             "identify takes a Record, or a Dataset('mine', train=[...], validation=[...], "
             f"tests=[...]), and not {type(given).__name__}{means if is_frame(given) else ''}."

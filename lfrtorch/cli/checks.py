@@ -1,4 +1,4 @@
-"""Refuse settings that cannot be: each command's own, before the slow import of torch."""
+"""Checks of the settings of each command, before the slow import of torch."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SIZES = {"nx", "nz", "nw", "nn", "degree"}
 
 
 def require_data(cfg: DictConfig) -> None:
-    """Say how data are chosen if none are."""
+    """Refuse a command without data, and say how data are chosen."""
     if cfg.get("data") is None:
         raise InputError(
             "no data chosen: add +bench=boucwen, or a file and its columns, "
@@ -31,7 +31,7 @@ def require_data(cfg: DictConfig) -> None:
 
 
 def check_plain(cfg: DictConfig) -> None:
-    """Refuse settings of a wrong type, beyond their limits, or that exclude each other."""
+    """Refuse settings that have a wrong type, are beyond their limits, or exclude each other."""
     require_data(cfg)
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     plain["known"] = plain["known"]["_target_"]
@@ -60,7 +60,7 @@ def check_plain(cfg: DictConfig) -> None:
 
 
 def _of_types(kind: Any, values: dict[str, Any]) -> Any:
-    """The declared settings among the values, each of its type."""
+    """Return the declared settings among the values; refuse a wrong type."""
     hints, given = get_type_hints(kind), {}
     for one in fields(kind):
         if one.name in values and not isinstance(values[one.name], dict):
@@ -71,7 +71,7 @@ def _of_types(kind: Any, values: dict[str, Any]) -> Any:
 
 
 def check_checkpoint(cfg: DictConfig) -> None:
-    """Refuse a command on a model without one."""
+    """Refuse a command that needs a model if ``checkpoint`` is not set."""
     if cfg.checkpoint is None:
         raise InputError(
             "checkpoint is not set: add checkpoint=DIR, the folder of a run or of a saved model."
@@ -79,7 +79,7 @@ def check_checkpoint(cfg: DictConfig) -> None:
 
 
 def check_simulation(cfg: DictConfig) -> None:
-    """Say what is missing or wrong for ``simulate``."""
+    """Refuse settings of ``simulate`` that are missing or wrong."""
     check_checkpoint(cfg)
     for option, value, example in (
         ("data.path", cfg.data.path, "FILE, the file of inputs"),
@@ -96,11 +96,11 @@ def check_simulation(cfg: DictConfig) -> None:
     if (cfg.start == "given") != (cfg.x0 is not None):
         raise InputError(
             f"start is {cfg.start!r} and x0 is {cfg.x0}; "
-            "a start state goes with start=given, and only with it."
+            "give a start state x0 with start=given, and only then."
         )
     x0 = cfg.x0 if isinstance(cfg.x0, ListConfig | None) else [None]
     if not all(isinstance(x, int | float) and np.isfinite(x) for x in x0 or []):
-        raise InputError(f"x0 is {cfg.x0}; give a list of finite numbers, one a state.")
+        raise InputError(f"x0 is {cfg.x0}; give a list of finite numbers, one for each state.")
     for name, least in (("estimate", 1), ("skip", 0)):
         if cfg[name] is not None:
             integer(name, cfg[name], least)
@@ -111,7 +111,7 @@ def check_simulation(cfg: DictConfig) -> None:
 
 
 def check_evaluation(cfg: DictConfig) -> None:
-    """Say what is missing or wrong for ``evaluate``."""
+    """Refuse settings of ``evaluate`` that are missing or wrong."""
     check_checkpoint(cfg)
     require_data(cfg)
     if cfg.out is not None and Path(str(cfg.out)).suffix.lower() != ".json":
@@ -119,7 +119,7 @@ def check_evaluation(cfg: DictConfig) -> None:
 
 
 def check_preview(cfg: DictConfig) -> None:
-    """Refuse a preview of no file."""
+    """Refuse a preview without a file."""
     if (cfg.get("data") or {}).get("path") is None:
         raise InputError("no file is named; give its path, or path=FILE.")
 

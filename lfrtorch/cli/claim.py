@@ -1,4 +1,4 @@
-"""The folder of a run is one's own, before anything is written into it."""
+"""Lock on the folder of a run, so that no other program writes into it."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import CONFIG, SNAPSHOTS
 
 PARTS = ("model", "linear", "figures", SNAPSHOTS, f"{SNAPSHOTS}/begun")
-"""Folders in that of a run whose files are replaced."""
+"""Folders in the folder of a run whose files a new run replaces."""
 
 _locks: dict[Path, int] = {}
-"""Open folders that are locked; the system unlocks them when the program ends, even if killed."""
+"""Open folders that are locked; the system unlocks them when the program ends or is killed."""
 
 
 class Claim(Callback):
-    """Hydra calls it before it makes the folder of one run, but not of several (``sweep``)."""
+    """Callback of Hydra before it makes the folder of a single run (for several see ``sweep``)."""
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         """Claim ``hydra.run.dir``."""
@@ -34,7 +34,7 @@ class Claim(Callback):
 
 
 def claim(folder: Path, cfg: DictConfig) -> None:
-    """Have a folder to oneself until the program ends, or refuse it; make it if it is missing."""
+    """Lock a folder until the program ends, or refuse it; make the folder if it is missing."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -58,14 +58,14 @@ def claim(folder: Path, cfg: DictConfig) -> None:
 
 
 def tidy(folder: Path) -> None:
-    """Remove what a run that was killed left unfinished in its folder."""
+    """Remove unfinished files that a killed run left in its folder."""
     if (folder / CONFIG).exists() or (folder / SNAPSHOTS).exists():
         for part in ("", *PARTS):
             remove_leftovers(folder / part)
 
 
 def locked(folder: Path) -> bool:
-    """Tell if the folder belongs to this program alone; True where the system has no locks."""
+    """Lock a folder and tell if that succeeded; True if the system has no locks."""
     try:
         import fcntl
     except ImportError:

@@ -21,11 +21,11 @@ COMMANDS = {
     "simulate": "run a saved model on the inputs of files",
     "export": "write a saved model as C, CasADi, ONNX, MATLAB, Python or FMU",
 }
-"""Modules of this room, in the order in which a user meets them, and what they do."""
+"""Commands in the order in which a user meets them, and what they do."""
 
 
 def main() -> None:
-    """Start the command that the first word names; its own words follow."""
+    """Start the command that the first word names, with the words after it."""
     word = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if word == "--version":
         print(versions())
@@ -40,13 +40,13 @@ def main() -> None:
 
 
 def start(command: str) -> None:
-    """Start a command; its help and its refusals come without what takes seconds to import."""
+    """Start a command; help and refusals come before imports that take seconds."""
     if {"--help", "-h"}.isdisjoint(sys.argv):
         from lfrtorch.cli import early
 
         early.take_words(config_name(command))
-        logging.getLogger("numexpr").setLevel(logging.WARNING)  # pandas has it tell its threads
-        gc.disable()  # until all is imported: there is much of it, and nothing in it is garbage
+        logging.getLogger("numexpr").setLevel(logging.WARNING)  # else it prints its threads
+        gc.disable()  # off until all is imported: imports make many objects, and no garbage
         task = import_module(f"lfrtorch.cli.{command}").main
         gc.freeze()
         gc.enable()
@@ -59,18 +59,18 @@ def start(command: str) -> None:
 
 
 def run(command: str, task: Callable[[Any], object]) -> None:
-    """Have Hydra compose the words of the program, which are whole, and start the task with it."""
+    """Have Hydra compose the completed words of the program, and start the task."""
     import hydra
 
     from lfrtorch.cli.errors import user_errors
     from lfrtorch.cli.hydra_versions import MAIN
 
-    with user_errors():  # those of several runs, when all have ended
+    with user_errors():  # errors of several runs, when all have ended
         hydra.main(**MAIN, config_path=str(CONF), config_name=config_name(command))(task)()
 
 
 def _nothing(_: Any) -> None:
-    """Do nothing: Hydra prints its help and ends before."""
+    """Do nothing: Hydra prints its help and ends the program before."""
 
 
 def config_name(command: str) -> str:
@@ -79,7 +79,7 @@ def config_name(command: str) -> str:
 
 
 def versions() -> str:
-    """Versions of lfrtorch and of what computes for it, as a report of a fault needs them."""
+    """Versions of lfrtorch and of the libraries below it, for a report of a fault."""
     import numpy as np
 
     built: Any = np.show_config(mode="dicts")  # pyright: ignore[reportCallIssue]
@@ -91,7 +91,7 @@ def versions() -> str:
 
 
 def usage() -> str:
-    """All commands, a line each."""
+    """A line for each command."""
     lines = [f"  lfrtorch {name:10}{what}" for name, what in COMMANDS.items()]
     example = "for example: lfrtorch fit x.csv inputs=force outputs=disp fs=750 nx=3"
     return "\n".join(["usage: lfrtorch COMMAND --help", *lines, example])

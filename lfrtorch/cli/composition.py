@@ -1,4 +1,4 @@
-"""Words of a command line: completed, and those that no configuration takes refused in a line."""
+"""Words of a command line: complete them, and refuse words that no configuration takes."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from lfrtorch.files.excel import workbook
 from lfrtorch.files.formats import FORMATS, extension, similar
 
 GROUPS = ("bla", "frf", "data", "trainer")
-"""Groups whose words are arguments of functions. A name in several means the last one."""
+"""Groups whose words are arguments of functions. A name in several groups means the last group."""
 
 declared.register()
 
 SWEEPS = {"-m", "--multirun"}
-"""Options that make several runs of several values."""
+"""Options that make a run for each of several values."""
 
-_DATE = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d-\d{6}")  # hydra.run.dir of a run of its own
-_SETTING = re.compile(r"[+~]*(?:hydra/)?[\w.]+=")  # what a word NAME=VALUE begins with
-# Commands whose data are a group.
+_DATE = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d-\d{6}")  # name of the folder of a single run
+_SETTING = re.compile(r"[+~]*(?:hydra/)?[\w.]+=")  # beginning of a word NAME=VALUE
+# Commands with a group ``data``.
 _DATA_CHOSEN = {"config", "linear", "evaluate", "preview"}
 _LISTS = {"data.inputs", "data.outputs", "data.reference"}
 
 
 def in_full(command: str, given: Sequence[str]) -> list[str]:
-    """The words with all that follows from them: ``x.csv inputs=u`` are a file and its columns."""
+    """The words in full: ``x.csv inputs=u`` becomes settings of a file and its columns."""
     words = with_names(given)
     names = [word.partition("=")[0].lstrip("+") for word in words]
     at = next((i for i, name in enumerate(names) if name in ("path", "data.path")), None)
@@ -54,7 +54,7 @@ def in_full(command: str, given: Sequence[str]) -> list[str]:
 
 
 def of_newest(word: str) -> str:
-    """The word; if it names a folder of runs for a model, the newest of these in its place."""
+    """The word; if its value is a folder of runs, where a model is wanted, the newest run in it."""
     name, _, value = word.partition("=")
     if name not in ("checkpoint", "init_from"):
         return word
@@ -72,7 +72,7 @@ def _has_model(folder: Path) -> bool:
 
 
 def chosen_by_data(words: Sequence[str]) -> list[str]:
-    """Sizes of a model of files that nobody gave, which the data choose; not in several runs."""
+    """Words for sizes that were not given, so that the data choose them; none in several runs."""
     if not SWEEPS.isdisjoint(words):
         return []
     pairs = [word.lstrip("+").partition("=") for word in words]
@@ -88,7 +88,7 @@ def chosen_by_data(words: Sequence[str]) -> list[str]:
 
 
 def with_names(given: Sequence[str]) -> list[str]:
-    """The words, those without a name that may be files as values of ``data.path``."""
+    """The words; words without a name that may be files become values of ``data.path``."""
     other = [
         word
         for word in given
@@ -104,12 +104,12 @@ def with_names(given: Sequence[str]) -> list[str]:
     if any(word.startswith(("data.path=", "path=")) for word in other):
         raise InputError("data.path is given twice; a path alone is data.path, too.")
     value = paths[0] if len(paths) == 1 else f"[{','.join(paths)}]"
-    at = next(i for i, word in enumerate(given) if word not in other)  # options stay where they are
+    at = next(i for i, word in enumerate(given) if word not in other)  # options keep their places
     return [*other[:at], f"data.path={value}", *other[at:]]
 
 
 def _may_be_file(word: str) -> bool:
-    """Tell if a word is a file, a pattern of files, or has the name of a measurement file."""
+    """Tell if a word is a file or a pattern of files, or ends like a measurement file."""
     path, _ = workbook(expanded(word))
     if path.is_dir() or ("=" in word and not path.exists()):
         return False
@@ -117,14 +117,14 @@ def _may_be_file(word: str) -> bool:
 
 
 def _plain_or_quoted(option: str, path: str) -> str:
-    """A path as a value, in quotes where Hydra would read it as something else."""
+    """A path as a value, in quotes if Hydra would read it as something else."""
     word = f"{option}={path}"
     found = read(word)
     return path if found and found.value() == path else in_quotes(path)
 
 
 def _listed(word: str, *, several: bool) -> str:
-    """Names of columns without brackets as a list; several of them are runs if there are some."""
+    """A word for columns with its names as a list; they are several runs if ``several``."""
     name, _, value = quoted(word).partition("=")
     if name not in _LISTS:
         return word
@@ -137,7 +137,7 @@ def _listed(word: str, *, several: bool) -> str:
 
 
 def in_groups(command: str, given: Sequence[str]) -> list[str]:
-    """The words, with their group before the names that messages have: ``start=estimated``."""
+    """The words with their groups: ``start=estimated`` becomes ``data.start=estimated``."""
     cfg = chosen(command, [parsed(word) for word in given if "=" in word])
     names = dict(spelt(_with_data(command, cfg)))
     tables = tuple(f"{name}." for name, node in cfg.items() if node == {})  # take any entry
@@ -148,11 +148,11 @@ def in_groups(command: str, given: Sequence[str]) -> list[str]:
 
 
 def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) -> DictConfig | None:
-    """Compose the words; refuse those that Hydra would not take, or that nothing would read.
+    """Compose the words; refuse words that Hydra would not take, or that nothing would read.
 
     Options of Hydra, as --help, compose nothing.
     """
-    # ``used`` may have words of an earlier run before them, which were taken then.
+    # ``used`` may begin with words of an earlier run, which took them.
     if {word for word in given if word.startswith("-")} - SWEEPS:
         return None
     words, every = (
@@ -168,7 +168,7 @@ def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) ->
 
 
 def chosen(command: str, words: Sequence[Override]) -> DictConfig:
-    """The configuration with the options of groups that words choose, and no other words."""
+    """The configuration with the words that choose options of groups, and without other words."""
     for word in words:
         name, value = word.key_or_group, word.value()
         if word.is_delete() and "." not in name and name != "data":
@@ -202,7 +202,7 @@ def parsed(word: str) -> Override:
 
 
 def several_values(word: Override, cfg: DictConfig) -> str:
-    """Message on values that are neither a list nor several runs."""
+    """Message about values that are neither a list nor several runs."""
     name, values = word.get_key_element(), word.get_value_string()
     listed = name.startswith("data.") or isinstance(OmegaConf.select(cfg, name), ListConfig)
     meant = f"for a list write {name}=[{values}], " if listed else ""
@@ -210,35 +210,35 @@ def several_values(word: Override, cfg: DictConfig) -> str:
 
 
 def is_choice(word: Override) -> bool:
-    """Tell if a word chooses an option of a group, of ours or of Hydra."""
+    """Tell if a word chooses an option of a group, which may be one of Hydra's."""
     return (CONF / word.key_or_group).is_dir() or word.is_hydra_override()
 
 
 def first_run(word: Override) -> str:
-    """The word of the first of several runs."""
+    """The word as it is in the first of several runs."""
     if not word.is_sweep_override():
         return str(word.input_line)
     return f"{word.get_key_element()}={next(word.sweep_string_iterator())}"
 
 
 def _of_first_run(words: Iterable[Override]) -> tuple[str, ...]:
-    """The words, without globs and intervals, whose values the sweeper alone knows."""
+    """The words without globs and intervals: only the sweeper knows their values."""
     known = (w for w in words if not (isinstance(w.value(), Glob) or w.is_interval_sweep()))
     return tuple(map(first_run, known))
 
 
 def composed(command: str, words: Sequence[str] = ()) -> DictConfig:
-    """The configuration; where Hydra cannot make one, the first line of its reason."""
+    """The configuration; if Hydra cannot make one, an error with the first line of its reason."""
     return deepcopy(_composed(CONF, command, tuple(words)))
 
 
-@lru_cache(maxsize=8)  # the groups of a command line are composed twice, 0.1 s each
+@lru_cache(maxsize=8)  # a command line is composed twice, in 0.1 s each
 def _composed(folder: Path, command: str, words: tuple[str, ...]) -> DictConfig:
     try:
-        within = GlobalHydra.instance().is_initialized()  # a command of Hydra, at its end
+        within = GlobalHydra.instance().is_initialized()  # at the end of a command of Hydra
         with nullcontext() if within else initialize_config_dir(**COMPOSED, config_dir=str(folder)):
             cfg = compose(command, list(words))
-            OmegaConf.to_container(cfg, resolve=True)  # a name that stands for nothing is an error
+            OmegaConf.to_container(cfg, resolve=True)  # raises if a name is not defined
             return cfg
     except (HydraException, OmegaConfBaseException) as failed:
         raise InputError(str(failed).splitlines()[0]) from None
@@ -250,7 +250,7 @@ def adds(word: Override) -> bool:
 
 
 def taken(word: Override, cfg: DictConfig) -> bool:
-    """Tell if a setting is read: it exists, or it is an added argument."""
+    """Tell if a setting is used: it exists, or it is an added argument."""
     group, _, name = word.key_or_group.rpartition(".")
     top = group.split(".")[0]
     if adds(word) and group and (top in cfg or (CONF / top).is_dir()):
@@ -258,11 +258,11 @@ def taken(word: Override, cfg: DictConfig) -> bool:
     node = OmegaConf.select(cfg, group) if group else cfg
     if not isinstance(node, DictConfig):
         return isinstance(node, ListConfig)
-    return name in node.keys()  # noqa: SIM118, a DictConfig contains no key that is yet to be given
+    return name in node.keys()  # noqa: SIM118, ``in node`` is False for a mandatory value
 
 
 def unknown(command: str, word: Override, cfg: DictConfig) -> str:
-    """Proposal for a setting that does not exist."""
+    """Proposal in place of a setting that does not exist."""
     key = word.key_or_group
     _, value = str(word.input_line).split("=", 1)
     if command in _DATA_CHOSEN and cfg.get("data") is None and key.startswith("data."):
@@ -279,16 +279,16 @@ def unknown(command: str, word: Override, cfg: DictConfig) -> str:
 
 
 def _with_data(command: str, cfg: DictConfig) -> DictConfig:
-    """The configuration; if no data are chosen, with the settings of files."""
+    """The configuration, with the settings of files if no data are chosen."""
     if command not in _DATA_CHOSEN or cfg.get("data") is not None:
         return cfg
     return DictConfig({**cfg, "data": OmegaConf.load(CONF / "data" / "file.yaml")})
 
 
 def spelt(cfg: DictConfig) -> Iterator[tuple[str, str]]:
-    """Names that a user may write for a setting, and its word on the command line."""
-    # Of a name in several groups the last of ``GROUPS`` is meant, above all groups that without
-    # one.
+    """Names that a user may write, and the setting that each name means."""
+    # A name in several groups means the last of ``GROUPS``; a setting outside the groups comes
+    # before all of them.
     groups = [name for name, node in cfg.items() if isinstance(node, DictConfig)]
     for group in sorted(map(str, groups), key=lambda name: (name in GROUPS, name)):
         for name in cfg[group]:

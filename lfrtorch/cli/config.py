@@ -43,26 +43,26 @@ def configured(cfg: DictConfig) -> Settings:
 
 
 def limit_threads(cfg: DictConfig) -> None:
-    """Compute on at most ``threads`` threads: more than there are cores cost time, up to hours."""
+    """Compute on at most ``threads`` threads; more threads than cores can cost hours."""
     if cfg.threads is not None:
         torch.set_num_threads(min(cfg.threads, os.cpu_count() or 1))
 
 
 def own_map(cfg: DictConfig, nz: int, nw: int) -> Module:
-    """A static map of the user's own."""
+    """Make a static map of the user's own."""
     options = {name: value for name, value in cfg.static.items() if name != "kind"}
     return users_own(options, nz=nz, nw=nw)
 
 
 def users_own(node: Any, **options: Any) -> Any:
-    """Call a target of the user's own; its module may stand in the working directory."""
+    """Call a target of the user's own; its module may be in the working directory."""
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     return instantiate(node, **options)
 
 
 def opened(cfg: DictConfig) -> lfrtorch.Model:
-    """The model of ``init_from`` as it was saved; sizes that it replaces are named."""
+    """The saved model of ``init_from``; a note names the sizes that it replaces."""
     own = own_map(cfg, cfg.nz, cfg.nw) if cfg.static.kind == "own" else None
     model = lfrtorch.load(cfg.init_from, static=own)
     if not model.lfr.cell.nw:
@@ -79,7 +79,7 @@ def opened(cfg: DictConfig) -> lfrtorch.Model:
 
 
 def loaded(cfg: DictConfig) -> Dataset:
-    """The records; what is to be known of them is printed, and kept for the report."""
+    """The records; notes on them are printed, and kept for the report."""
     dataset: Dataset = decided(instantiate(cfg.data))
     measured = [record for record in dataset.train if record.source == "file"]
     given = dict(cfg.get("bla") or {})

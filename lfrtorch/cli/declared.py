@@ -1,4 +1,4 @@
-"""Settings that Python declares, as nodes of the configuration and as lines of the help."""
+"""Settings that Python declares, as nodes of the configuration and lines of the help."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.least_squares.options import AdamOptions, LevenbergMarquardtOptions
 
 YAML = {"True": "true", "False": "false", "None": "null"}
-"""Values that YAML writes in another way than Python."""
+"""Values that YAML and Python write differently."""
 
 _KINDS = {
     "settings": PlainSettings,
@@ -25,7 +25,7 @@ _KINDS = {
 
 
 def register() -> None:
-    """Let the files of ``conf/`` name the declared settings."""
+    """Register the declared settings, so that files of ``conf/`` can name them."""
     for node, kind in _KINDS.items():
         cfg = OmegaConf.create()
         for name, default, _ in _declared(kind):
@@ -35,7 +35,7 @@ def register() -> None:
 
 
 def _declared(kind: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
-    """Word, default and help of each setting; those of a dataclass among them one by one."""
+    """Word, default and help of each setting, with the fields of dataclasses one by one."""
     for one in fields(kind):
         if one.default is MISSING:
             yield from _declared(one.default_factory, f"{prefix}{one.name}.")
@@ -44,7 +44,7 @@ def _declared(kind: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
 
 
 def _lines(node: str, prefix: str = "") -> str:
-    """Lines of the help, in words of the command line instead of the reference's."""
+    """Lines of the help, in words of the command line instead of Python."""
     found: list[str] = []
     for name, default, help in _declared(_KINDS[node], prefix):
         value = list(default) if isinstance(default, tuple) else default

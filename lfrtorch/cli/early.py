@@ -1,4 +1,4 @@
-"""Check the command line before the slow import of torch: its words, settings and file."""
+"""Checks of the words, settings and file of a command line, before the slow import of torch."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from lfrtorch.files.loggers import READERS
 from lfrtorch.files.measurement import Wanted, read_measurement
 
 _SMALL = 2**22
-"""Bytes of a file up to which it is read twice: a tenth of a second."""
+"""Largest number of bytes of a file that is read twice: this takes a tenth of a second."""
 
 
 def take_words(command: str) -> None:
-    """Complete the words of the program, and end it with a message if they cannot be."""
+    """Complete the words of the program, or end it with a message if they are wrong."""
     with user_errors():
         given = [of_newest(word) for word in in_full(command, sys.argv[1:])]
         words, several = given, not SWEEPS.isdisjoint(given)
@@ -34,7 +34,7 @@ def take_words(command: str) -> None:
             words = sweep.words_of_runs(given) if several else run_folder.arguments(given)
         if command == "config":
             words = [*words, *chosen_by_data(words)]
-        if several:  # their errors come to user_errors, and not as tracebacks
+        if several:  # errors then come to user_errors, without tracebacks
             os.environ["HYDRA_FULL_ERROR"] = "1"
         if os.environ.get("RANK", "0") != "0":
             words = [*words, *run_folder.SILENT]
@@ -47,7 +47,7 @@ def take_words(command: str) -> None:
 
 
 def check_file(data: Any) -> None:
-    """Refuse a single file, its columns or its sampling frequency, if it is read without delay."""
+    """Refuse a single file, its columns or its sampling frequency, if the file is read fast."""
     if data is None or data.get("_target_") != "lfrtorch.load_records":
         return
     path = data.path

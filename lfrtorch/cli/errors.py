@@ -1,4 +1,4 @@
-"""Errors of users as one line, and notes in the words of the command line."""
+"""Errors of users in one line, and notes in words of the command line."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from lfrtorch.cli.interrupts import TerminatedError, as_error, handled
 
 @contextmanager
 def user_errors() -> Iterator[None]:
-    """Errors of users end the program with a message and exit code 1; bugs keep a traceback."""
+    """End the program with a message and exit code 1 for errors of users; bugs keep a traceback."""
     rank = os.environ.get("RANK", "0")
-    # A message names the group of the configuration, which a function's argument belongs to:
+    # A message names the group of the configuration to which the function's argument belongs:
     # ``data: seed is -1``.
     error = "error" if rank == "0" else f"error on rank {rank}"
 
@@ -32,7 +32,7 @@ def user_errors() -> Iterator[None]:
         with handled(as_error):
             yield
         return
-    except TerminatedError as end:  # as a program ends that a signal ended
+    except TerminatedError as end:  # exit as if the signal had ended the program
         if rank == "0":
             print(end, file=sys.stderr)
         sys.exit(128 + end.number)
@@ -53,7 +53,7 @@ def user_errors() -> Iterator[None]:
 
 
 def _where(error: BaseException) -> str:
-    """The group of the configuration that the call was made from, for the message."""
+    """Name, for the message, of the group of the configuration that made the call."""
     nodes = [note.removeprefix(NODE) for note in notes_of(error) if note.startswith(NODE)]
     return f"{nodes[0]}: " if nodes and nodes[0] else ""
 
@@ -66,14 +66,14 @@ def _of_the_settings(error: BaseException) -> bool:
 
 
 def _of_memory(error: BaseException) -> bool:
-    """Tell if memory was too small, which torch reports as a RuntimeError."""
+    """Tell if memory was too small; torch reports this as a RuntimeError."""
     return isinstance(error, MemoryError) or (
         isinstance(error, RuntimeError) and "memory" in str(error) and "alloc" in str(error)
     )
 
 
 def as_words(note: str) -> str:
-    """Return a note with its settings as words of a command: feedthrough=false, start=zero."""
+    """Return a note with its settings as words of a command, such as ``feedthrough=false``."""
     note = note.replace("by Record(valid=...) or ", "by ").replace(", or Record(valid=...)", "")
     note = re.sub(r"\b(\w+)='(\w+)'", r"\1=\2", note)
     return re.sub(r"\b(\w+)=(True|False)\b", lambda m: f"{m[1]}={m[2].lower()}", note)

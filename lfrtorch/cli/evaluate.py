@@ -27,12 +27,12 @@ from lfrtorch.model.model import check_channels
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.evaluation import Evaluation
 
-_FILES = "lfrtorch.load_records"  # what reads files of one's own
-_DIVIDES = "data.validation", "data.test"  # words that divide them by use
+_FILES = "lfrtorch.load_records"  # target that reads a user's own files
+_DIVIDES = "data.validation", "data.test"  # words that divide records by use
 
 
 def evaluate(cfg: DictConfig) -> None:
-    """Print the scores of the checkpoint's model, and write them if that is asked for."""
+    """Print the scores of the checkpoint's model, and write them if ``out`` is set."""
     command = shlex.join([*program("scripts/evaluate.py"), *HydraConfig.get().overrides.task])
     check_evaluation(cfg)
     folder = str(cfg.checkpoint)
@@ -47,8 +47,8 @@ def evaluate(cfg: DictConfig) -> None:
     if bla is None and model.sizes["nz"]:
         print(f"note: '{folder}' has no folder linear/, so no linear model is scored")
     elif bla is not None and dataset.linear:
-        print("note: the linear model is that of all training records; a run has one a test")
-    scored = replace(dataset, train=[])  # which is not scored, and need not be simulated
+        print("note: the linear model is that of all training records; a run has one for each test")
+    scored = replace(dataset, train=[])  # not scored, so not simulated
     evaluation = Evaluation(dataset=scored, linear=bla, model=model)
     scores = report.scored(evaluation, command)
     print(f"\n{report.table(evaluation)}")
@@ -71,7 +71,7 @@ def evaluate(cfg: DictConfig) -> None:
 
 
 def from_files(cfg: DictConfig, model: lfrtorch.Model, command: str) -> None:
-    """Complete the data: the model's channels; all records are tests if the run saw none."""
+    """Complete the data by the model's channels; all records are tests if the run used none."""
     for side, channels in (("inputs", model.inputs), ("outputs", model.outputs)):
         if cfg.data[side] is None:
             cfg.data[side] = [channel.name for channel in channels]
@@ -95,7 +95,7 @@ def fitted(checkpoint: str, path: str | list[str]) -> bool:
 
 
 def resolved(path: str | list[str]) -> set[Path]:
-    """The files of paths and patterns; none if they are gone."""
+    """The files of paths and patterns; empty if the files are gone."""
     try:
         return {real(file) for file in listed_files(path, "data.path")}
     except FileNotFoundError:
@@ -103,7 +103,7 @@ def resolved(path: str | list[str]) -> set[Path]:
 
 
 def linear_beside(checkpoint: str) -> lfrtorch.LinearModel | None:
-    """The linear model of a run, whose folder or ``model/`` folder is given, if it has one."""
+    """The linear model of a run, if there is one; ``checkpoint`` is its folder or ``model/``."""
     folder = Path(checkpoint)
     places = [folder / "linear", *([folder.parent / "linear"] if folder.name == "model" else [])]
     found = next((place for place in places if place.is_dir()), None)

@@ -23,7 +23,7 @@ from lfrtorch.model.model import Model
 
 
 def written(cfg: DictConfig) -> None:
-    """Write the files, and say how they are used."""
+    """Write the files, and print how they are used."""
     check_checkpoint(cfg)
     if cfg.to is None:
         raise InputError(f"to is not set: add to=c, or another of {', '.join(export.TARGETS)}.")
@@ -39,7 +39,7 @@ def written(cfg: DictConfig) -> None:
 
 
 def observer_of(cfg: DictConfig, model: Model | LinearModel) -> bool | NoiseCovariance:
-    """The observer that is asked for: with Q and R an extended Kalman filter."""
+    """The observer that the settings ask for; with Q and R an extended Kalman filter."""
     if cfg.Q is None and cfg.R is None:
         if cfg.observer and model.K is None:
             raise InputError(
@@ -53,7 +53,7 @@ def observer_of(cfg: DictConfig, model: Model | LinearModel) -> bool | NoiseCova
 
 
 def _variances(name: str, given: Any) -> Array:
-    """A variance, or several."""
+    """One variance, or a list of variances."""
     try:
         return np.array(given, dtype=np.float64)
     except (TypeError, ValueError):

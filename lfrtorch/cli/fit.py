@@ -57,8 +57,8 @@ from lfrtorch.reporting.verdict import LINEAR_MODEL
 
 
 def run(cfg: DictConfig, folder: Path, command: str = "") -> float:
-    """Identify and write files, by the first process alone; return the validation RMSE."""
-    # A fit that ended early has its files written before the error of that.
+    """Identify, and let the first process write files; return the validation RMSE."""
+    # If a fit ended early, its files are written before the error is raised.
     first = current().rank == 0
     cfg = chosen_before(cfg, folder)
     settings = configured(cfg)
@@ -82,7 +82,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "") -> float:
             write(
                 found, folder, command=command, config=config, draw=cfg.figures, board=files.board
             )
-            # Most lines of advice that are printed; the report has all.
+            # At most five items of advice are printed; the report has all.
             for item in found.advice[:5]:
                 print(f"next: {item.text}\n      ({item.evidence})")
                 if typed := item.command(command):
@@ -106,7 +106,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "") -> float:
 
 
 class _Folder(Console):
-    """The first process: prints, and keeps the folder of the run up to date during the fit."""
+    """First process, which prints and keeps the folder of the run up to date during the fit."""
 
     def __init__(self, cfg: DictConfig, folder: Path, *, least: float) -> None:
         super().__init__()
@@ -151,7 +151,7 @@ class _Folder(Console):
 
 
 def main(cfg: DictConfig) -> float:
-    """Run the command of the command line."""
+    """Run the command as the command line asks."""
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
     cfg.threads = sweep.threads(job, cfg.threads)
@@ -163,7 +163,7 @@ def main(cfg: DictConfig) -> float:
 
 
 def launched(cfg: DictConfig, folder: Path, command: str) -> float:
-    """One run, by all processes that torchrun started; errors of users end the program."""
+    """Make one run with all processes of torchrun; errors of users end the program."""
     rank = os.environ.get("RANK", "0")
     with ExitStack() as stack:
         stack.enter_context(user_errors())
@@ -177,6 +177,6 @@ def launched(cfg: DictConfig, folder: Path, command: str) -> float:
 
 
 def _common(folder: Path) -> Path:
-    """The first process's folder."""
+    """The folder of the first process, in all processes."""
     name = torch.tensor(list(str(folder).encode()), dtype=torch.uint8)
     return Path(bytes(agreed(name).tolist()).decode())

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: a fit ends between two iterations, and what it found is kept."""
+"""Ctrl-C and SIGTERM: a fit ends between two iterations, and its best iterate is kept."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lfrtorch._support.errors import LfrtorchError
 
 
 class TerminatedError(LfrtorchError):
-    """A signal ended the program, SIGTERM or another ``number``."""
+    """The program was ended by SIGTERM, or by another signal ``number``."""
 
     def __init__(self, message: str, number: int = signal.SIGTERM) -> None:
         super().__init__(message)
@@ -23,8 +23,8 @@ class TerminatedError(LfrtorchError):
 
 @contextmanager
 def handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
-    """Inside, ``handler`` takes SIGTERM, and Ctrl-C unless it is ignored."""
-    # What it raises while compiled code calls Python, as numba's compiler does, is lost there.
+    """Context in which ``handler`` handles SIGTERM, and Ctrl-C unless the system ignores it."""
+    # An exception of the handler is lost if compiled code, such as numba's, has called Python.
     hook = sys.unraisablehook
 
     def lost(failed: sys.UnraisableHookArgs) -> None:
@@ -32,13 +32,13 @@ def handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
         if not isinstance(failed.exc_value, TerminatedError | KeyboardInterrupt):
             hook(failed)
         elif handler is as_error:
-            # It comes again once the library is done.
+            # The signal is sent again, after the library is done.
             again = threading.Timer(0.05, os.kill, (os.getpid(), number))
             again.daemon = True
             again.start()
 
     numbers = [signal.SIGTERM]
-    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background job
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # ignored in a shell's background job
         numbers.append(signal.SIGINT)
     usual = {number: signal.signal(number, handler) for number in numbers}
     sys.unraisablehook = lost
@@ -51,25 +51,25 @@ def handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
 
 
 def at_once(number: int, _: Any = None) -> None:
-    """End the program while modules load: an import might take an exception for its own."""
+    """End the program while modules load: an import could catch an exception as its own."""
     how = "interrupted" if number == signal.SIGINT else "terminated"
     os.write(2, f"{how} before it began: nothing to keep\n".encode())
     os._exit(128 + number)
 
 
 def as_error(number: int, _: Any = None) -> None:
-    """End the program outside a fit, with no unfinished file left behind."""
+    """End the program outside a fit, by an exception, so that no unfinished file is left."""
     if number == signal.SIGINT:
         raise KeyboardInterrupt
     raise TerminatedError("terminated outside the fit: nothing to keep")
 
 
 class Termination:
-    """Ctrl-C and SIGTERM as a request that a fit asks for before each iteration, its ``stop``."""
+    """Function ``stop`` of a fit: tells, before each iteration, if Ctrl-C or SIGTERM came."""
 
-    # So no write is torn. A second Ctrl-C ends the program at once, and before a fit has begun the
-    # first one does. A batch system sends SIGTERM before it kills, and torchrun to processes that
-    # are left.
+    # So no file is left half written. A second Ctrl-C ends the program at once; before the fit has
+    # begun, the first one does. Batch systems send SIGTERM before they kill a program, and torchrun
+    # sends it to the remaining processes.
 
     def __init__(self) -> None:
         self.asked = 0

@@ -30,13 +30,13 @@ from lfrtorch.reporting.evaluation import Evaluation
 
 
 def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
-    """One run, its files written into ``folder``."""
+    """Make one run, and write its files into ``folder``."""
     settings = configured(cfg)
     limit_threads(cfg)
     dataset = loaded(cfg).with_windows()
     print(f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples")
     frf, notes = response(cfg, dataset.train)
-    # A fit to the response takes the one that the figures show.
+    # A fit to the response uses the response that the figures show.
     terminal = Console()
     data = frf if frf and wants_response(cfg, dataset.train) else None
     data = data or linear_records(dataset.train, settings, terminal)
@@ -67,7 +67,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
 def response(
     cfg: DictConfig, records: Sequence[lfrtorch.Record]
 ) -> tuple[lfrtorch.FRF | None, list[str]]:
-    """The measured frequency response, if the records give one, and notes."""
+    """The measured frequency response, or None, and notes."""
     asked_for = cfg.frf.method != "auto" or wants_response(cfg, records)
     try:
         frf: lfrtorch.FRF = instantiate(cfg.frf, records)

@@ -1,4 +1,4 @@
-"""Look at measurements before any fit: a table, what will hurt a model, and a figure."""
+"""Look at measurements before any fit: a table, faults that will hurt a model, and a figure."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ def main(cfg: DictConfig) -> None:
 
 
 def place(path: Path) -> str:
-    """A file's name with its folders below the working one, or all: files are called alike."""
+    """A file's name with its folders: from the working directory on, if the file is below it."""
     full, here = real(path), real(Path())
     folders = full.relative_to(here) if full.is_relative_to(here) else full.relative_to(full.anchor)
     return "_".join([*folders.parts[:-1], stem_of(path)])
 
 
 def figure_path(asked: str | None, name: str, files: int) -> Path:
-    """Where the figure of a file goes: as asked for one, with the file's name for several."""
+    """Path of the figure of a file: ``out`` for one file, with the file's name for several."""
     if asked is None:
         return Path(f"{name}_preview.png")
     out = Path(asked)
@@ -65,7 +65,7 @@ def figure_path(asked: str | None, name: str, files: int) -> Path:
 
 
 def show(path: Path, data: DictConfig, figure: Path) -> None:
-    """Print what a file holds, and draw it."""
+    """Print the contents of a file, and draw it."""
     table = open_table(path)
     seen = look_at(table, data.inputs, data.outputs, time=data.time, fs=data.fs)
     found = survey_measurement(seen.u, seen.y, seen.fs, inputs=seen.inputs, outputs=seen.outputs)
@@ -94,7 +94,7 @@ def show(path: Path, data: DictConfig, figure: Path) -> None:
 
 
 def beginning(seen: Measurement, test: Any) -> list[str]:
-    """Start of the record that a fit would take, if its linear models decide it."""
+    """The start of a record that a fit would choose by linear models, in words."""
     T = len(seen.y) - (round(test * len(seen.y)) if is_fraction(test) else 0)
     u, y = seen.u[:T], seen.y[:T]
     if not seen.inputs or not np.isfinite(u).all() or find_period(u) is not None:

@@ -1,4 +1,4 @@
-"""Words of the command line in letters of any alphabet, quoted for Hydra, which reads ASCII."""
+"""Words of the command line with any letters, quoted for Hydra, which reads only ASCII."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _PIECES = re.compile(
     rf"(?:{_KEPT}) | (?P<name>(?:{_PART}|[^\[\]{{}},()])(?:{_PART}|\[\d+\]|[^\[\]{{}},()])*)",
     re.VERBOSE,
 )
-"""Signs, strings in quotes and functions of a value; names between them: Force (N), acc[0]."""
+"""Signs, quoted strings and functions in a value; between them, names such as Force (N), acc[0]."""
 
 _PAIR = re.compile(rf"""\s*({_TEXT}|[^:,'"]+?)\s*:\s*({_TEXT}|[^,'"]+?)\s*(?:,|$)""")
 
 _RENAMED = tuple(map(int, version("omegaconf").split(".")[:2])) >= (2, 4)
 register_resolver = getattr(OmegaConf, f"register_{'' if _RENAMED else 'new_'}resolver")
-"""Gives a function a name in settings."""
+"""Name of a function in settings."""
 
 register_resolver(
     "table", lambda *pairs: dict(zip(pairs[::2], pairs[1::2], strict=True)), replace=True
@@ -37,7 +37,7 @@ register_resolver(
 
 @cache
 def read(word: str) -> Override | None:
-    """The word as Hydra reads it, if it can."""
+    """The word as Hydra reads it, or None."""
     try:
         return OverridesParser.create().parse_override(word)
     except HydraException:
@@ -45,8 +45,8 @@ def read(word: str) -> Override | None:
 
 
 def quoted(word: str) -> str:
-    """The word with quotes around names in its value that Hydra could not read without."""
-    # A word that Hydra can read, or that quotes would not help, comes back as it is.
+    """The word with quotes around names in its value that Hydra cannot read without quotes."""
+    # A word that Hydra can read, or cannot read with quotes either, is returned as it is.
     name, equals, value = word.partition("=")
     if not equals or read(word):
         return word
@@ -56,18 +56,18 @@ def quoted(word: str) -> str:
 
 
 def _piece(found: re.Match[str]) -> str:
-    """A piece of a value; blanks after a name are none of it."""
+    """A piece of a value; blanks after a name are not part of the name."""
     name = (found["name"] or "").rstrip()
     return found[0].replace(name, in_quotes(name)) if name and not read(f"x=[{name}]") else found[0]
 
 
 def _table(text: str) -> str:
-    """A table of names, whose keys Hydra cannot read in quotes either."""
+    """A table of names: Hydra cannot read its keys, even in quotes."""
     cells = [cell for pair in _PAIR.findall(text) for cell in pair]
     spelt = ",".join(cell if cell[0] in "'\"" else in_quotes(cell) for cell in cells)
     return f"{{{text}}}" if _PAIR.sub("", text) else f"${{table:{spelt}}}"
 
 
 def in_quotes(text: str) -> str:
-    """A text as Hydra reads it, whatever is in it."""
+    """Any text in quotes that Hydra reads."""
     return QuotedString(text, Quote.single).with_quotes()

@@ -1,4 +1,4 @@
-"""The folder of a run: its words, its settings, and how to go on with it."""
+"""The folder of a run: its words, its settings, and how the run goes on."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.paths import expanded
 
 CONFIG = "config.yaml"
-"""Settings of a run, in its folder."""
+"""File of the settings, in the folder of a run."""
 
 SNAPSHOTS = "resume"
-"""Snapshots of the starts of a run, in its folder."""
+"""Folder of the snapshots of the starts, in the folder of a run."""
 
 STARTS = "starts"
-"""Events of the starts that go to the end, in the folder of a run."""
+"""Folder of the events of the starts that run to the end, in the folder of a run."""
 
 USED = "used"
-"""In the settings there: the numbers that the fit has chosen, or was given."""
+"""Key in ``CONFIG`` of the numbers that the fit has chosen, or was given."""
 
 OVERRIDES = Path(".hydra", "overrides.yaml")
-"""There, too: the words of its command line."""
+"""File of the words of the command line, in the folder of a run."""
 
 
 SILENT = ("hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none")
-"""Settings of Hydra for all processes of a fit but the first, which alone has it write files."""
+"""Settings of Hydra for all processes of a fit but the first: only the first writes files."""
 
 
 def world() -> int:
@@ -44,7 +44,7 @@ def world() -> int:
 
 
 def arguments(given: Sequence[str]) -> list[str]:
-    """The command line, after the settings of the run in ``resume=DIR`` if there is one."""
+    """The command line; with ``resume=DIR``, the words of that run come before."""
     values = dict(argument.split("=", 1) for argument in given if "=" in argument)
     folder = values.get("resume", "null")
     if folder != "null":
@@ -67,7 +67,7 @@ def arguments(given: Sequence[str]) -> list[str]:
 
 
 def words_of(folder: str | Path, given: Sequence[str] = ()) -> list[str]:
-    """The words that made the run in a folder; those that name code only if given as well."""
+    """The words that made the run in a folder; words that name code must be given again."""
     overrides = expanded(Path(folder) / OVERRIDES)
     listed = read_settings(overrides)
     if not (isinstance(listed, list) and all(isinstance(word, str) for word in listed)):
@@ -82,7 +82,7 @@ def words_of(folder: str | Path, given: Sequence[str] = ()) -> list[str]:
 
 
 def read_settings(path: Path) -> Any:
-    """Contents of a YAML file in a run's folder, if it is whole and has no aliases."""
+    """Contents of a YAML file in a run's folder; refuse a damaged file, or one with aliases."""
     try:
         text = path.read_text(encoding="utf-8")
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
@@ -95,10 +95,10 @@ def read_settings(path: Path) -> Any:
 
 
 def chosen_before(cfg: DictConfig, folder: Path) -> DictConfig:
-    """The configuration with as many starts as the run to go on with had.
+    """The configuration with as many starts as the resumed run had.
 
-    They follow from the iterations, of which there may be more now. Sizes are chosen again, to the
-    same end.
+    ``starts=auto`` follows from the number of iterations, which may be larger now. Sizes are chosen
+    again, with the same result.
     """
     if cfg.resume is None or cfg.starts != "auto" or not (folder / CONFIG).is_file():
         return cfg
@@ -120,13 +120,13 @@ def program(script: str) -> list[str]:
 
 
 def go_on(folder: Path) -> str:
-    """Command that continues a run that ended early."""
+    """Text with the command that continues a run that ended early."""
     return f"to go on: {shlex.join(program('train.py'))} resume={folder}"
 
 
 @contextmanager
 def resumable(folder: Path) -> Iterator[None]:
-    """If a disk fails inside, the message says how to go on."""
+    """Context in which the message on a disk failure says how to continue."""
     try:
         yield
     except OSError as error:
@@ -137,7 +137,7 @@ def resumable(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def no_empty_folder(folder: Path) -> Iterator[None]:
-    """A run that fails before it has a model leaves no folder, if nothing else is in it."""
+    """Context that removes the folder of a run that fails before it has a model."""
     try:
         yield
     except BaseException:

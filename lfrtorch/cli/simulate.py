@@ -36,7 +36,7 @@ from lfrtorch.use.file_simulation import (
 
 
 def simulate(cfg: DictConfig) -> None:
-    """Simulate every file, write what comes out, and print the scores."""
+    """Simulate every file, write the outputs, and print the scores."""
     check_simulation(cfg)
     pairs = targets(cfg)
     model = lfrtorch.load(str(cfg.checkpoint))
@@ -72,7 +72,7 @@ def simulate(cfg: DictConfig) -> None:
 
 
 def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:
-    """Refuse another sampling frequency than the model's."""
+    """Refuse a sampling frequency that differs from the model's."""
     if cfg.data.fs is not None and not np.isclose(cfg.data.fs, model.fs):
         raise InputError(
             f"data.fs is {cfg.data.fs} Hz and the model's sampling frequency {model.fs:g} Hz; "
@@ -81,7 +81,7 @@ def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:
 
 
 def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> Start:
-    """The state to start from, as the settings say."""
+    """The start state that the settings ask for."""
     if cfg.start == "given":
         return Start(np.array(cfg.x0, dtype=np.float64), cfg.skip or 0)
     if cfg.start == "zero":
@@ -92,7 +92,7 @@ def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> S
 
 
 def scored(path: Path, model: lfrtorch.Model, result: Simulated) -> list[list[tables.Cell]]:
-    """Rows of the table of scores, one an output."""
+    """Rows of the table of scores, one for each output."""
     scores = result.scores
     counted = [of_samples(count, result.samples, result.skip) for count in scores.samples.tolist()]
     return [
@@ -102,18 +102,18 @@ def scored(path: Path, model: lfrtorch.Model, result: Simulated) -> list[list[ta
 
 
 def introduced(folder: str, model: lfrtorch.Model) -> str:
-    """Channels, rate and sizes in a line."""
+    """A line with channels, rate and sizes."""
     sizes = ", ".join(f"{name} {size}" for name, size in model.sizes.items() if size)
     u, y = (", ".join(map(str, channels)) for channels in (model.inputs, model.outputs))
     return f"{folder}: {u} -> {y} at {model.fs:g} Hz, {sizes}"
 
 
 def targets(cfg: DictConfig) -> list[tuple[Path, Path]]:
-    """Each file that is read with that which is written."""
+    """Pairs of each file that is read, and the file that is written for it."""
     paths = listed_files(cfg.data.path, "data.path")
     out = expanded(str(cfg.out))
     if out.is_dir() or not out.suffix:
-        # Of a compressed file the name within.
+        # A compressed file gives its name without the last ending.
         stems = [Path(path.name.removesuffix(".gz")).stem for path in paths]
         twice = next((stem for stem in stems if stems.count(stem) > 1), None)
         if twice is not None:
@@ -140,7 +140,7 @@ def targets(cfg: DictConfig) -> list[tuple[Path, Path]]:
 
 @contextmanager
 def about(path: Path) -> Iterator[None]:
-    """Name the file in a message that does not."""
+    """Context that adds the file's name to messages without it."""
     try:
         yield
     except InputError as error:

@@ -16,22 +16,22 @@ from lfrtorch.cli.composition import parsed
 from lfrtorch.cli.quotes import register_resolver
 from lfrtorch.cli.run_folder import world
 
-_LONGEST = 120  # characters of a folder's name; file systems take 255 bytes
+_LONGEST = 120  # largest number of characters of a folder's name; file systems allow 255 bytes
 
 LAUNCHERS = {
     "joblib": "hydra_plugins.hydra_joblib_launcher",
     "submitit_local": "hydra_plugins.hydra_submitit_launcher",
     "submitit_slurm": "hydra_plugins.hydra_submitit_launcher",
 }
-"""Launchers of several runs at once, and the packages that they need."""
+"""Launchers that make several runs at once, and the packages that they need."""
 
 
 class RunFailedError(LfrtorchError):
-    """One of several runs ended with an error, which it has printed."""
+    """One of several runs ended with an error, and has printed it."""
 
 
 def folder_name(varied: str) -> str:
-    """The name of a run's folder, from its own words: ``nn=5,seed=0``."""
+    """The name of a run's folder from the words in which runs differ: ``nn=5,seed=0``."""
     name = quote(varied, safe="=,+[]{}:() ") or "run"
     if len(name) <= _LONGEST:
         return name
@@ -42,7 +42,7 @@ register_resolver("folder_name", folder_name, replace=True)
 
 
 def words_of_runs(given: Sequence[str]) -> list[str]:
-    """The command line of several runs, with what names their folders."""
+    """The command line of several runs, with words that name their folders."""
     if world() > 1:
         raise InputError("torchrun shares one fit; start several runs one after another.")
     if any(word.startswith("resume=") for word in given):
@@ -58,13 +58,13 @@ def words_of_runs(given: Sequence[str]) -> list[str]:
 
 
 def threads(job: Any, given: int | None) -> int | None:
-    """Threads of a run: one beside others, or the CPUs that a cluster gives it."""
+    """Threads of a run: one if other runs go on beside it, or the CPUs that a cluster gives it."""
     alone = job.mode != RunMode.MULTIRUN or job.launcher._target_.endswith(".BasicLauncher")
     return given if alone or given is not None else job.launcher.get("cpus_per_task") or 1
 
 
 def one_of_several(run: Callable[[], float], folder: Path, *, overwrite: bool) -> float:
-    """A run beside others: an error of the user ends it alone, a signal all of them."""
+    """Make a run beside others: an error of the user ends only this run, a signal all runs."""
     if (folder / "metrics.json").exists() and not overwrite:
         raise RunFailedError(
             f"'{folder}' holds a run; give another hydra.sweep.dir, or overwrite=true."

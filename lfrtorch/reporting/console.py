@@ -1,4 +1,4 @@
-"""An observer that prints: sentences, and a progress line while the fit runs."""
+"""An observer that prints sentences, and a progress line while the fit runs."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ class Console(Observer):
         self._line: ProgressLine | StartsLine | None = None
 
     def say(self, text: str) -> None:
-        """Print it."""
+        """Print a sentence."""
         print(in_lines(text), flush=True)
 
     def searching(self) -> None:
-        """Show a line."""
+        """Show a progress line during the search for sizes."""
 
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
     ) -> Watching:
-        """Show a line that follows the iterations; of several starts a line a round stays."""
+        """Show a progress line; with several starts, one line for each round stays."""
         count = len(models)
         if count == 1:
             self._line = ProgressLine()
@@ -43,11 +43,11 @@ class Console(Observer):
         return Watching([[lines]] * count, lines.round)
 
     def end(self, result: FitResult) -> None:
-        """End the line."""
+        """End the progress line."""
         self.close()
 
     def close(self) -> None:
-        """End the line, if there is one."""
+        """End the progress line, if there is one."""
         if self._line is not None:
             self._line.close()
         self._line = None

@@ -1,4 +1,4 @@
-"""One evaluation of models: every record is simulated once, and all of a report reads what came."""
+"""One evaluation of models: every record is simulated once, and the report uses the results."""
 
 from __future__ import annotations
 
@@ -22,39 +22,39 @@ from lfrtorch.model.model import Model
 from lfrtorch.reporting.opponent import Opponents, output
 
 _LINEAR, _NL_LFR = "linear", "NL-LFR"  # names of the two models
-_HOLD = "hold"  # the name of no model: what was measured stays
+_HOLD = "hold"  # name of the prediction that the last measured output stays
 
 CROSS = "cross-validation"
-"""Name of what stands for a validation record if all records are fitted."""
+"""Name of the record that takes the place of a validation record if all records are fitted."""
 
-_STILL = 0.1  # deviation of a signal over that in training, up to which it stands still
+_STILL = 0.1  # a signal is still up to this part of its standard deviation in training
 
 HORIZONS = 1, 10, 100
-"""Samples ahead that predictions are scored at."""
+"""Numbers of samples ahead at which predictions are scored."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """Simulation errors on one record, or a group of them, after the skip window."""
+    """Simulation errors on one record, or on a group of records, after the skip window."""
 
     use: str  # "train", "validation", "selection" or "test"
     source: str  # "official", "simulated", "stand-in" or "file"
     channels: tuple[Channel, ...]  # of the outputs
     samples: int
     skip: int  # samples at the beginning that do not count
-    scored: int  # how many do
-    rmse: float | None  # of the NL-LFR; None without one; of outputs of several units the nrmse
-    lti_rmse: float | None  # of the linear model
-    std: float  # of the measured output over the scored samples; 1 of several units
-    nrmse: float | None  # rmse / std, each output's own
+    scored: int  # number of samples that count
+    rmse: float | None  # error of the NL-LFR, or None; the nrmse if outputs have several units
+    lti_rmse: float | None  # error of the linear model
+    std: float  # standard deviation of the measured output; 1 if outputs have several units
+    nrmse: float | None  # error over the standard deviation of each output
     rmse_by_output: tuple[float, ...]
     lti_rmse_by_output: tuple[float, ...]
     std_by_output: tuple[float, ...]
-    start_error: float | None  # what an estimated start's uncertainty adds to rmse
+    start_error: float | None  # part of rmse by the uncertainty of an estimated start
     records: int = 1
     sums: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Errors summed over the samples of a horizon, by measure and by model."""
-    ahead: int | None = None  # how far predictions are ahead whose errors these are
+    ahead: int | None = None  # samples ahead, if these are errors of predictions
 
     @property
     def counted(self) -> str:
@@ -68,7 +68,7 @@ class Score:
         return added is not None and error is not None and added > 0.2 * error  # 2 % of its power
 
     def entry(self) -> dict[str, Any]:
-        """For ``metrics.json``: errors of each output and the number of records if several."""
+        """Entry of ``metrics.json``, with errors by output and the number of records if several."""
         names = ("rmse", "lti_rmse", "nrmse")
         found: dict[str, Any] = {name: getattr(self, name) for name in names}
         found["unit"] = ", ".join(dict.fromkeys(channel.unit for channel in self.channels))
@@ -88,7 +88,7 @@ class Score:
 
 
 def finite(entry: Any) -> Any:
-    """The same nested entries with None for every number that JSON cannot hold."""
+    """The same nested entries with None in place of every number that JSON cannot hold."""
     if isinstance(entry, dict):
         return {key: finite(value) for key, value in entry.items()}
     if isinstance(entry, list):
@@ -97,7 +97,7 @@ def finite(entry: Any) -> Any:
 
 
 def of_samples(scored: int, samples: int, skip: int, records: int = 1) -> str:
-    """Scored samples, in words: the last ones of a record."""
+    """The scored samples in words, such as "last 400 of 2000"."""
     if not scored:
         return "not scored"
     last = skip and scored == samples - skip and records == 1
@@ -113,7 +113,7 @@ class Response:
     simulated: Mapping[str, Array]  # outputs (T, ny) by "linear" and "NL-LFR", one or both
     start_error: float | None = None
     sums: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by measure and model
-    ahead: int | None = None  # samples that outputs are predicted ahead; else they are simulated
+    ahead: int | None = None  # samples ahead of predicted outputs; None if they are simulated
 
     @property
     def y_linear(self) -> Array:
@@ -132,12 +132,12 @@ class Response:
 
     @property
     def error(self) -> Array:
-        """Error of the NL-LFR after the skip window (scored samples, ny), 0 if y is not valid."""
+        """The NL-LFR's error after the skip window (scored samples, ny); 0 where y is not valid."""
         return self.record.errors(self.y_hat)
 
     @property
     def linear_error(self) -> Array:
-        """Error of the linear model after the skip window (scored samples, ny), likewise."""
+        """Error of the linear model after the skip window; as ``error``."""
         return self.record.errors(self.y_linear)
 
     @property
@@ -147,7 +147,7 @@ class Response:
 
     @cached_property
     def score(self) -> Score:
-        """Errors of both models; the record says which samples are scored."""
+        """Errors of both models on the samples that the record scores."""
         record, outputs = self.record, self.simulated.items()
         alike = of_one_unit(record.outputs)
         errors = {name: (rmse if alike else nrmse)(record, y) for name, y in outputs}
@@ -180,18 +180,18 @@ class Evaluation:
     """An NL-LFR and linear models on all records of a dataset, each simulated once."""
 
     dataset: Dataset
-    linear: LinearModel | None = None  # of all training records
-    predictors: Opponents = field(default_factory=dict)  # other ones by the horizon
+    linear: LinearModel | None = None  # linear model of all training records
+    predictors: Opponents = field(default_factory=dict)  # linear models for predictions
     model: Model | None = None
-    refitted: Model | None = None  # to all estimation records: it simulates the tests
-    own: Mapping[str, LinearModel] = field(default_factory=dict)  # of single tests, by name
-    horizon: int | None = None  # of the fit: how far ahead records with measured starts are scored
-    left_out: Sequence[Response] = ()  # by models that were fitted and chosen without each sample
+    refitted: Model | None = None  # model fitted to all estimation records, for the tests
+    own: Mapping[str, LinearModel] = field(default_factory=dict)  # linear models of single tests
+    horizon: int | None = None  # samples ahead at which records with measured starts are scored
+    left_out: Sequence[Response] = ()  # responses of cross-validation
 
     @cached_property
     def simulations(self) -> list[Response]:
         """All records with both simulations."""
-        # Estimated starts of training records are fitted to all samples, as in the fit.
+        # The estimated start of a training record is fitted to all its samples, as in the fit.
         found = []
         for use, record in self._records:
             linear, model = self._models(use, record)
@@ -207,7 +207,7 @@ class Evaluation:
         return [*found, *self.left_out]
 
     def _ahead(self, record: Record, use: str, horizon: int) -> Response:
-        """A record from each of its outputs on: what is shown is the last sample of the horizon."""
+        """Predictions of a record from each of its samples; figures show the end of each."""
         linear, model = self._models(use, record)
         models = {_LINEAR: None if linear is None else linear.to_model(), _NL_LFR: model}
         models = {name: each for name, each in models.items() if each is not None}
@@ -231,7 +231,7 @@ class Evaluation:
 
     @cached_property
     def predictions(self) -> dict[int, list[Response]]:
-        """All records with predictions so many samples ahead, of models with K; else nothing."""
+        """All records with predictions by their samples ahead; empty for models without K."""
         if self.model is None or self.model.K is None:
             return {}
         found: dict[int, list[Response]] = {horizon: [] for horizon in HORIZONS}
@@ -248,7 +248,7 @@ class Evaluation:
 
     @cached_property
     def scores(self) -> dict[tuple[str, str], Score]:
-        """Simulation errors by the use and the name of a record, or of a group of records."""
+        """Simulation errors by the use and the name of a record or group."""
         found: dict[tuple[str, str], list[Score]] = {}
         for response in self.simulations:
             name = self.dataset.score_of(response.record)
@@ -257,7 +257,7 @@ class Evaluation:
         return {key: _together(of) if key[1] in groups else of[-1] for key, of in found.items()}
 
     def scores_of(self, *uses: str) -> dict[str, Score]:
-        """Scores of these uses by the name of a record or group."""
+        """Scores of the records with these uses, by the name of the record or group."""
         return {n: score for use in uses for (of, n), score in self.scores.items() if of == use}
 
     @property
@@ -271,7 +271,7 @@ class Evaluation:
         return [(use, record) for use, records in uses.items() for record in records]
 
     def _models(self, use: str, record: Record) -> tuple[LinearModel | None, Model | None]:
-        """The linear model and the NL-LFR that a record is simulated by."""
+        """The linear model and the NL-LFR that simulate a record."""
         if use != "test":
             return self.linear, self.model
         own = self.own.get(self.dataset.score_of(record), self.linear)
@@ -281,7 +281,7 @@ class Evaluation:
 def cross_validated(
     left_out: Sequence[tuple[Record, Array, Array]],
 ) -> list[Response]:
-    """Records with the outputs of the linear model and the NL-LFR where they were left out."""
+    """Responses of both models to the stretches of records that their fits left out."""
     found = []
     for record, linear, y_hat in left_out:
         name = CROSS if len(left_out) == 1 else f"{record.name}, {CROSS}"
@@ -291,14 +291,14 @@ def cross_validated(
 
 
 def training_deviations(responses: Sequence[Response]) -> tuple[Array, Array]:
-    """Standard deviations of inputs (nu,) and outputs (ny,) in training, or without it in all."""
+    """Standard deviations of inputs (nu,) and outputs (ny,) in training, or in all records."""
     train = [r for r in responses if r.use == "train"] or responses
     u, y = (np.concatenate(signal) for signal in zip(*map(_signals, train), strict=True))
     return u.std(axis=0), y.std(axis=0)
 
 
 def has_settled(response: Response, deviations: tuple[Array, Array]) -> bool:
-    """Tell whether inputs and outputs stand still, against their deviations in training."""
+    """Tell whether inputs and outputs move little, relative to their deviations in training."""
     signals = zip(_signals(response), deviations, strict=True)
     return all((signal.std(axis=0) <= _STILL * usual).all() for signal, usual in signals)
 
@@ -308,7 +308,7 @@ def _signals(response: Response) -> tuple[Array, Array]:
 
 
 def ranked(responses: Sequence[Response]) -> list[Response]:
-    """The tests, without tests validation, else training; the largest error of the NL-LFR first."""
+    """The tests, or the validation or training records; the NL-LFR's largest error comes first."""
     uses = [use for use in ("test", "validation", "train") if any(r.use == use for r in responses)]
 
     def relative(response: Response) -> float:
@@ -320,7 +320,7 @@ def ranked(responses: Sequence[Response]) -> list[Response]:
 
 
 def worst_residuals(responses: Sequence[Response]) -> Residuals | None:
-    """Residuals of the record with the largest error, of those that do not diverge."""
+    """Residuals of the record with the largest error among those that do not diverge."""
     for response in ranked(responses):
         if not response.diverged and len(response.scored) >= SHORTEST:
             return Residuals(of_simulation(response.record, response.y_hat))
@@ -328,7 +328,7 @@ def worst_residuals(responses: Sequence[Response]) -> Residuals | None:
 
 
 def _together(scores: Sequence[Score]) -> Score:
-    """The score of a group of records: means of the RMSE of each output of each record."""
+    """The score of a group of records: the mean of the records' RMSE for each output."""
 
     def mean(values: Sequence[Any]) -> float | None:
         return None if None in values else float(np.mean(values))

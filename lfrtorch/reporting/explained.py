@@ -1,4 +1,4 @@
-"""Part of the errors of a simulation that a filter would explain: dynamics that a model lacks."""
+"""Part of simulation errors that a filter explains: the model lacks these dynamics."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from lfrtorch._support.types import Array
 from lfrtorch.reporting.evaluation import Response
 
 LONGEST = 1024
-"""Most samples of a segment, which limit the memory of an error filter."""
+"""Largest number of samples of a segment, which limits the memory of an error filter."""
 
 SHORTEST = 64
-"""Samples below which a segment tells nothing."""
+"""Smallest number of samples of a segment."""
 
 
 SHIFTS = 0.276, 0.382, 0.618, 0.724
-"""Parts of the records by which errors are shifted to see what is explained by chance: no fractions
-of few periods."""
+"""Shifts of the errors, as parts of the records, that show what is explained by chance. None is
+near a simple fraction, so that periodic errors do not coincide with themselves."""
 
 
 def explained_parts(train: Sequence[Response]) -> tuple[float | None, float | None]:
-    """Parts of the errors that filters of inputs explain, and of outputs² and ³ beyond."""
-    # The first says that states are missing, the second that the static map is too small. None if
-    # the records are too short, or a simulation diverges.
+    """Part of the errors that filters of the inputs explain, and further part by outputs² and ³."""
+    # If the first is large, states are missing; if the second is large, the static map is too
+    # small. Both are None if the records are too short, or a simulation diverges.
     errors = [response.error for response in train]
     inputs = [response.record.u[response.record.skip :] for response in train]
     if any(response.diverged for response in train):
@@ -39,7 +39,7 @@ def explained_parts(train: Sequence[Response]) -> tuple[float | None, float | No
     linear = coherent_part(inputs, errors)
     both = [np.hstack(pair) for pair in zip(inputs, powers, strict=True)]
     beyond = coherent_part(both, errors)
-    alike = coherent_part(inputs, errors, of=both[0].shape[1])  # by the same filters' memory
+    alike = coherent_part(inputs, errors, of=both[0].shape[1])  # with the same memory of filters
     if beyond is None or alike is None:
         return linear, None
     return linear, max(0.0, beyond - alike)
@@ -49,15 +49,15 @@ def coherent_part(
     signals: Sequence[Array],
     errors: Sequence[Array],
     *,
-    of: int | None = None,  # signals that the filters' memory is short enough for; default: n
+    of: int | None = None,  # number of signals that sets the memory of the filters; default: n
 ) -> float | None:
     """Part of the errors' power that linear filters of the signals explain, by Welch's method."""
-    # At each line, it is the multiple coherence times the error's power, corrected for its bias
-    # with n signals and K segments, as the adjusted R² is. Of several outputs the largest part
-    # counts.
+    # At each line, the explained power is the multiple coherence times the error's power. It is
+    # corrected for its bias with n signals and K segments, like the adjusted R². With several
+    # outputs, the largest part is returned.
     n = signals[0].shape[1]
     T, shortest = sum(map(len, errors)), min(map(len, errors))
-    # Segments for each regressor that a coherence is estimated from, at least.
+    # A coherence is estimated from at least 8 segments for each regressor.
     most = T / (8 * (of or n))
     N = 2 ** int(math.log2(max(1, min(LONGEST, most, shortest))))
     if N < SHORTEST:
@@ -73,7 +73,7 @@ def coherent_part(
         S += np.einsum("ift,jft->fij", Z, Z.conj())
     Sxx, Sxe = S[:, :n, :n], S[:, :n, n:]
     power = np.real(np.diagonal(S, axis1=1, axis2=2))[:, n:]
-    # Lines that an input does not excite must not divide by their rounding errors.
+    # At lines that an input does not excite, Sxx is a rounding error, and must not divide.
     largest = float(np.real(np.trace(Sxx, axis1=1, axis2=2)).max())
     floor = np.eye(n) * max(1e-9 * largest, np.finfo(float).eps)
     explained = np.einsum("fxe,fxe->fe", Sxe.conj(), np.linalg.solve(Sxx + floor, Sxe)).real
@@ -86,9 +86,9 @@ def coherent_part(
 
 def filtered_part(signals: Sequence[Array], errors: Sequence[Array], lags: int) -> float | None:
     """Part of the errors' power that filters of ``lags`` samples explain, by least squares."""
-    # What they explain by chance is taken off: the mean of what they explain of the errors shifted
-    # in time, which is far more for slow errors than for white ones.
-    # Too short a memory tells nothing.
+    # The part that is explained by chance is subtracted: the mean part for errors that are shifted
+    # in time. It is far larger for slow errors than for white ones. The result is None for filters
+    # with too short a memory.
     if lags < 12:
         return None
     memory = np.concatenate(

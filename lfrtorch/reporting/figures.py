@@ -22,22 +22,23 @@ from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.step_plots import steps
 
 MOST_OUTPUTS = 4
-"""Most outputs in one figure."""
+"""Largest number of outputs in one figure."""
 
 MOST_RECORDS = 4
-"""Most records of which the report has all views."""
+"""Largest number of records of which the report shows all views."""
 
 _MOST_WORK = 1e9
-"""Samples times squared parameters up to which the bands are drawn: a second or two."""
+"""Largest number of samples times squared parameters with which bands are drawn: 1 to 2 s."""
 
 Views = dict[str, dict[str, str]]
 """Captions by the names of records, then of figures."""
 
 
 def of_run(run: Run) -> tuple[dict[str, Figure], Views]:
-    """All figures of a run by file name, and captions of the records that the report shows."""
-    # These are the tests; without tests validation, else training. The first has the largest error;
-    # of a group that makes one score it is the only one.
+    """All figures of a run by file name, and captions of the records in the report."""
+    # The report shows the tests; without tests, the validation or training records. The first has
+    # the largest error. From a group with one score, only the record with the largest error is
+    # shown.
     model, bla, dataset = run.fit.model, run.linear, run.dataset
     drawn, views = of_records(run.simulations, dataset, _uncertainty(run))
     with suppress(InputError):  # a linear model, or one that diverges
@@ -56,7 +57,7 @@ def of_run(run: Run) -> tuple[dict[str, Figure], Views]:
 def of_records(
     simulated: Sequence[Response], dataset: Dataset, known: Uncertainty | None = None
 ) -> tuple[dict[str, Figure], Views]:
-    """Errors of all tests, and all views of the records with the largest errors."""
+    """Figures of the errors of all tests, and all views of the records with the largest errors."""
     largest: dict[str, Response] = {}
     for response in ranked(simulated):
         largest.setdefault(dataset.score_of(response.record), response)
@@ -81,21 +82,21 @@ def of_records(
 def of_record(
     record: Record, simulated: plots.Simulated, known: Uncertainty | None = None
 ) -> tuple[dict[str, Figure], dict[str, str]]:
-    """All views of a record by file name, and captions of those of its first outputs."""
+    """All views of a record by file name, and captions of the views of its first outputs."""
     name, ny = record.name, len(record.outputs)
     whole = plots.is_whole(record)
     spectrum = plots.spectrum if whole else plots.density
     of_spectrum = "Spectrum over whole periods." if whole else "Power spectral density."
-    of_near, band = "The grey stretch, about the largest error.", _band(record, known)
+    of_near, band = "The grey stretch, near the largest error.", _band(record, known)
     if known is not None and band is not None:
-        of_near += " Band: where 95 % of the errors are if noise and what the data leave open of "
-        of_near += "the parameters are all there is."
+        of_near += " Band: it contains 95 % of the errors, if all errors come from noise and from "
+        of_near += "the uncertainty of the parameters."
         of_near += "".join(f" But {doubt.rstrip('.')}." for doubt in known.doubts[:1])
     views = (
         ("_response" * whole, plots.response, "Outputs and errors. Fit: 100 % − NRMSE."),
         ("_near", partial(plots.close_up, band=band), of_near),
         ("_density" * (not whole), spectrum, of_spectrum),
-        ("_distribution", plots.distribution, "How often which error occurs."),
+        ("_distribution", plots.distribution, "Distribution of the errors."),
     )
     drawn, captions = {}, {}
     more = f" Outputs {MOST_OUTPUTS + 1} to {ny}: in figures/." if ny > MOST_OUTPUTS else ""
@@ -110,7 +111,7 @@ def of_record(
 
 
 def _uncertainty(run: Run) -> Uncertainty | None:
-    """Uncertainty of the parameters, if the model is one of simulations and not too large."""
+    """Uncertainty of the parameters, if simulations were fitted and the model is not too large."""
     records = run.dataset.train if run.refit is None else estimation_records(run.dataset)
     samples = sum(record.y.size for record in records)
     large = samples * run.model.parameter_count**2 > _MOST_WORK
@@ -123,7 +124,7 @@ def _uncertainty(run: Run) -> Uncertainty | None:
 
 
 def _band(record: Record, known: Uncertainty | None) -> Band | None:
-    """The band of a record that is not too long for it."""
+    """The band of a record; None if the record is too long, or the band is not finite."""
     if known is None or record.y.size * len(known.kept) ** 2 > _MOST_WORK:
         return None
     band = known.simulate(record)
@@ -132,7 +133,7 @@ def _band(record: Record, known: Uncertainty | None) -> Band | None:
 
 def _measured(records: Sequence[Record]) -> FRF | None:
     """The nonparametric frequency response, if the records give one in seconds."""
-    # It takes 3 s up to there.
+    # Up to this length, the estimate takes at most 3 s.
     if sum(record.samples for record in records) > 500_000:
         return None
     try:

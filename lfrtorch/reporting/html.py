@@ -51,7 +51,7 @@ from lfrtorch.reporting.scores import (
 )
 from lfrtorch.reporting.verdict import LINEAR_MODEL, of_linear
 
-_FEW = 3  # most tests that the verdict names one by one
+_FEW = 3  # at most so many tests are named one by one
 
 _PAGES = jinja2.Environment(
     loader=jinja2.PackageLoader("lfrtorch.reporting"),
@@ -70,7 +70,7 @@ def render(
     command: str = "",
     config: str = "",
 ) -> str:
-    """Make the page of a run; images are PNG by name, views captions by record and name."""
+    """Make the page of a run; ``images`` are PNG files by name, ``views`` captions by record."""
     tried = run.metrics["sizes_search"]
     groups = [(name, w) for name, w in run.fit.model.lfr.cell.named_parameters() if w.numel()]
     return _PAGES.get_template("report.html").render(
@@ -106,7 +106,7 @@ def _address(png: bytes) -> str:
 
 def comparisons(evaluation: Evaluation) -> list[str]:
     """Errors of the NL-LFR and of the linear model: a line for each output of a few tests."""
-    # Without tests the lines are on the validation records, or else on the training records.
+    # Without tests, the lines are about the validation records, or else the training records.
     responses = evaluation.simulations
     _, usual = training_deviations(responses)
     uses = ("test", "validation", "train")
@@ -114,7 +114,7 @@ def comparisons(evaluation: Evaluation) -> list[str]:
     shown = []
     for response in (response for response in responses if response.use == use):
         rows = [r for r in rows_of(response.record.name, response.score) if r.output != ALL]
-        # As the verdict has it: a record in which little happens is no measure.
+        # As in the verdict: a record in which little happens is not a measure.
         rows = [r._replace(std=np.fmax(r.std, own)) for r, own in zip(rows, usual, strict=True)]
         shown += [(r.record + f", {r.output}" * (len(rows) > 1), r) for r in rows]
     scored = sorted((item for item in shown if item[1].ratio > 0), key=lambda item: item[1].ratio)
@@ -202,14 +202,14 @@ def _data(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _moments(x: Array) -> list[float]:
-    """Mean, rms about it, smallest and largest sample; a mean that is rounding errors is 0."""
+    """Mean, standard deviation, smallest and largest sample; a mean of rounding errors is 0."""
     mean, deviation = float(np.mean(x)), float(np.std(x))
     mean = 0.0 if abs(mean) < 1e-12 * deviation else mean
     return [mean, deviation, float(np.min(x)), float(np.max(x))]
 
 
 def _poles(run: Run) -> list[Sequence[Cell]]:
-    """Rows of the table of poles, those of the NL-LFR at rest."""
+    """Rows of the table of poles of both models; the NL-LFR's poles are those at rest."""
     of = ("linear", run.linear.poles), ("NL-LFR", poles_at_rest(run.fit.model))
     return [
         [model, number(p["frequency"], 4), number(p["damping"], 4), radius(p["radius"]),

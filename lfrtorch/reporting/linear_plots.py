@@ -1,4 +1,4 @@
-"""Figures of a linear model and of the response it was found from: they read results."""
+"""Figures of a linear model, and of the measured response that it was fitted to."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
 
-# Colours of all that is drawn.
+# Colours of the lines.
 MEASURED, TOTAL, _, EVEN, DIFFERENCE, _ = CHANNELS
 MODEL, NOISE, ODD = "black", "0.5", TOTAL
 
@@ -31,19 +31,19 @@ _GRID = 500  # frequencies at which a model is drawn, beside those of its poles
 _LOWEST = 1e-3  # first frequency of a model drawn alone, relative to half the sampling frequency
 
 RANGE = 120.0
-"""Most dB that an axis shows: a zero of a model on a grid point is no information."""
+"""Largest range of an axis in dB: a zero of a model on a grid point must not stretch the axis."""
 
 ABOVE = 30.0
-"""Most dB above the model: a measured response at lines without excitation is no information."""
+"""Largest dB above the model: measured responses at lines without excitation mean nothing."""
 
 STRETCHES = 200
-"""Parts of the frequency axis: a variance is drawn as its mean over each. Line by line it hid the
-dots of a record of 50000 samples."""
+"""Number of parts of the frequency axis; a variance is drawn as its mean over each part. Drawn line
+by line, it hid the dots of a record of 50000 samples."""
 
 _COLOURS = 10
-"""Most pairs of an output and an input whose zeros have a colour and a name each."""
+"""Zeros have a colour and a name for each output and input, up to so many pairs."""
 
-_FAR = 2.0  # half width of the z plane that is drawn: sampling puts zeros far out that say little
+_FAR = 2.0  # half width of the drawn z plane: zeros far out come from sampling and mean little
 
 
 def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
@@ -75,7 +75,7 @@ def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
                     if variance is not None:
                         level = _mean(frf.frequencies, variance[:, i, j])
                         magnitude.plot(*level, lw=1.2, color=colour, label=label)
-                # Measured phases stand in the turn of the model's: noise makes no jumps of 360°.
+                # Measured phases are within 180° of the model's: noise makes no jumps of 360°.
                 turned = angle[lines] + np.angle(G * fit[lines].conj())
                 _dots(phase, frf.frequencies, np.degrees(turned), "nonparametric", MEASURED)
             magnitude.plot(f, decibel(fit), lw=1.0, color=MODEL, label="model")
@@ -127,7 +127,7 @@ def poles_and_zeros(model: LinearModel) -> Figure:
 
 def distortion(frf: FRF) -> Figure:
     """Draw levels at the output of the fast method: signal, odd and even distortion, noise."""
-    # Distortions are drawn as measured, noise included: what stands out of the noise is nonlinear.
+    # Distortions are drawn with the noise in them: levels above the noise are nonlinear.
     levels = frf.distortion
     if levels is None:
         raise InputError(
@@ -175,7 +175,7 @@ def order_scan(scan: OrderScan) -> Figure:
 
 
 def zeros(model: LinearModel) -> dict[str, Complex]:
-    """Transmission zeros of a square model under the name ``""``, else zeros by channel."""
+    """Transmission zeros of a square model by the name ``""``; of any other, zeros by channel."""
     if len(model.inputs) == len(model.outputs):
         return {"": model.zeros()}
     return {
@@ -186,7 +186,7 @@ def zeros(model: LinearModel) -> dict[str, Complex]:
 
 
 def frequencies(model: LinearModel, frf: FRF | None = None) -> Array:
-    """Frequencies (Hz) a model is drawn at: a grid in the band, and its resonances."""
+    """Frequencies (Hz) at which a model is drawn: a grid in the band, and the resonances."""
     lines = np.array([_LOWEST, 1.0]) * model.fs / 2 if frf is None else frf.frequencies
     first, last = float(lines[0]), float(lines[-1])
     spaced = np.geomspace if is_wide(first, last) else np.linspace
@@ -200,7 +200,7 @@ def _dots(ax: Axes, f: Array, level: Array, label: str, colour: str, marker: str
 
 
 def _mean(f: Array, variance: Array) -> tuple[Array, Array]:
-    """Frequencies and dB of a variance, its mean over each stretch of the axis that has lines."""
+    """Frequencies and dB of a variance, as means over the stretches of the axis with lines."""
     spaced = np.geomspace if is_wide(f[0], f[-1]) else np.linspace
     stretch = np.searchsorted(spaced(f[0], f[-1], STRETCHES + 1)[1:-1], f, side="right")
     _, first, count = np.unique(stretch, return_index=True, return_counts=True)
@@ -209,12 +209,12 @@ def _mean(f: Array, variance: Array) -> tuple[Array, Array]:
 
 
 def _legend(figure: Figure, ax: Axes) -> None:
-    """One legend beside the panels, which all have the same lines."""
+    """Draw one legend beside the panels, which all have the same lines."""
     figure.legend(*ax.get_legend_handles_labels(), loc="outside right upper", markerscale=3)
 
 
 def _limit(ax: Axes, model: Array | None = None) -> tuple[float, float]:
-    """The limits of the axis, no more than RANGE apart, and no more than ABOVE above the model."""
+    """Set limits of the axis that are at most RANGE apart, and at most ABOVE above the model."""
     low, high = ax.get_ylim()
     drawn = np.zeros(0) if model is None else model[np.isfinite(model)]
     high = min(high, drawn.max() + ABOVE) if len(drawn) else high

@@ -31,20 +31,20 @@ from lfrtorch.reporting import plots
 
 
 class TensorBoard:
-    """Scalars of every iteration, and figures of the validation record now and then."""
+    """Writer of the scalars of every iteration, and of figures of a record now and then."""
 
-    # The file is made at the first iteration that is written. It replaces what earlier files in the
-    # folder have of this and later iterations: a fit that goes on has each of them once.
+    # The file is made at the first iteration that is written. It replaces this and later iterations
+    # of earlier files in the folder, so that a fit that goes on has each iteration once.
 
     def __init__(
         self,
         folder: str | Path,
-        record: Record | None = None,  # whose output and static map are drawn
-        y_linear: plots.Array | None = None,  # output of the linear model on it, (T, ny)
+        record: Record | None = None,  # its output and static map are drawn
+        y_linear: plots.Array | None = None,  # the linear model's output on this record, (T, ny)
         every: int = 50,  # iterations between figures, which cost about half a second
         *,
         finalist: bool = False,  # write nothing before the last round of several starts
-        say: Callable[[str], None] = warnings.warn,  # told once if the file cannot be written
+        say: Callable[[str], None] = warnings.warn,  # called once if the file cannot be written
     ) -> None:
         self.folder, self.finalist, self._say = Path(folder), finalist, say
         self.record, self.y_linear, self.every = record, y_linear, every
@@ -58,7 +58,7 @@ class TensorBoard:
         return self._writer is not None
 
     def history(self, history: Sequence[Progress]) -> None:
-        """Log iterations of the past."""
+        """Log past iterations."""
         for progress in history:
             self._write(progress.iteration, lambda writer, one=progress: _add(writer, one))
 
@@ -79,7 +79,7 @@ class TensorBoard:
                 self.figure("signals/static_map", static_figure(model, self.record), step)
 
     def round(self, ended: Round) -> None:
-        """Log the errors of several starts after a round of theirs."""
+        """Log the errors of several starts after a round."""
         step = max(start.iterations for start in ended.starts)
         for name, error in errors_of_round(ended).items():
             self._scalar(f"starts/{name}", error, step)
@@ -89,7 +89,7 @@ class TensorBoard:
         self.image(name, plots.png(figure), step)
 
     def image(self, name: str, png: bytes, step: int) -> None:
-        """Add a figure that is drawn already."""
+        """Add a figure that is already a PNG file."""
         width, height = Image.open(io.BytesIO(png)).size
         image = Summary.Image(
             encoded_image_string=png, width=width, height=height, colorspace=len("RGB")
@@ -114,7 +114,7 @@ class TensorBoard:
             self._scalar(name, value, step)
 
     def close(self) -> None:
-        """Write what is pending."""
+        """Write all pending events and close the file."""
         if self.begun:
             self._write(0, lambda writer: writer.close())
 
@@ -122,7 +122,7 @@ class TensorBoard:
         self._write(step, lambda writer: writer.add_scalar(name, value, step))
 
     def _write(self, step: int, write: Callable[[SummaryWriter], None]) -> None:
-        """Write with the writer, made at the first step, as long as that works."""
+        """Write with the writer, which is made at the first step; do nothing after a failure."""
         if self._failed:
             return
         try:
@@ -139,10 +139,10 @@ class TensorBoard:
 
 
 def _wait_for_a_later_name(folder: Path) -> None:
-    """Let the second pass in which the last file was made."""
-    # TensorBoard reads files in the order of their names, which begin with the second: within one,
-    # file 10 of a process comes before its file 9.
-    end = monotonic() + 1.5  # whatever the clock does
+    """Wait until the second is over in which the last file was made."""
+    # TensorBoard reads files in the order of their names, which begin with the second. Within the
+    # same second, file 10 of a process would come before its file 9.
+    end = monotonic() + 1.5  # even if the clock is set
     while monotonic() < end and any(folder.glob(f"events.out.tfevents.{int(time())}.*")):
         sleep(0.02)
 
@@ -180,12 +180,12 @@ def quiet_writers() -> Iterator[None]:
 
 
 class Checkpoint:
-    """The best iterate so far on disk, of all starts that call it: what a killed run leaves."""
+    """Writer of the best iterate of all starts so far, so that a killed run leaves a model."""
 
     def __init__(
         self,
         folder: str | Path,
-        every: float = 5.0,  # least seconds between two
+        every: float = 5.0,  # smallest number of seconds between two files
         least: float = math.inf,  # score that an iterate must beat
     ) -> None:
         self.folder, self.every = Path(folder), every
@@ -193,7 +193,7 @@ class Checkpoint:
         self._unwritten: Model | None = None
 
     def __call__(self, model: Model, progress: Progress) -> None:
-        """Keep the iterate if it is the best; write the best one when it is time."""
+        """Keep the iterate if it is the best so far; write the best one when it is due."""
         if progress.best and progress.score < self._least:
             self._unwritten, self._least = copy.deepcopy(model), progress.score
         if self._unwritten is not None and monotonic() >= self._due:

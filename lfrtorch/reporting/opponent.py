@@ -1,8 +1,8 @@
-"""The linear model that an NL-LFR is compared with: the best for the error that is judged.
+"""The linear model that an NL-LFR is compared with: the best one for the error that is judged.
 
-A fit to predictions gives a good start where a controller closes the loop, and may simulate worse
-than a constant. An NL-LFR that beats such a model beats nothing. So linear models of the other
-criteria stand beside it, and estimation records choose: tests have no say.
+If a controller closes the loop, a linear model fitted to predictions is a good start, but it may
+simulate worse than a constant. To be better than such a model means nothing. So linear models are
+also fitted by the other criteria, and the estimation records, not the tests, choose among them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lfrtorch.linear.bla import Criterion, estimate_bla
 from lfrtorch.linear.model import LinearModel
 
 Opponents = Mapping[int | None, LinearModel]
-"""Linear models by the samples that outputs are predicted ahead; None: by simulation."""
+"""Linear models by the number of samples ahead of predictions; the key None is for simulation."""
 
 
 def opponents(
@@ -35,15 +35,15 @@ def opponents(
     options: Mapping[str, Any],
     ahead: Sequence[int] = (),
 ) -> Opponents:
-    """Choose the linear model of an order for simulations, and for predictions so far ahead.
+    """Choose the linear model of an order for simulations, and for predictions ``ahead``.
 
     Args:
-        linear: that the NL-LFR begins with.
-        records: that linear models are estimated from.
-        dataset: whose training, validation and selection records choose.
+        linear: model that the NL-LFR starts from.
+        records: records that linear models are estimated from.
+        dataset: its training, validation and selection records choose.
         nx: order.
         options: arguments of :func:`lfrtorch.estimate_bla`.
-        ahead: horizons of the predictions that are judged; none of simulations alone.
+        ahead: horizons of the predictions that are judged; empty if only simulations are judged.
     """
     wanted: list[Criterion] = ["simulation"] if not ahead else ["prediction", "simulation"]
     same = linear.nx == nx and linear.fit is not None
@@ -53,11 +53,11 @@ def opponents(
         if refine in known:
             continue
         own = {**options, "refine": refine}
-        if refine == "prediction":  # which finds poles near 1 without
+        if refine == "prediction":  # it finds poles near 1 without integrators
             own["integrators"] = 0
         try:
             models.append(estimate_bla(records, nx, **own))
-        except InputError:  # what the criterion of the start does without, such as a longer record
+        except InputError:  # this criterion may need a longer record than that of the start
             continue
     if len(models) == 1:
         return dict.fromkeys((None, *ahead), models[0])
@@ -75,7 +75,7 @@ def opponents(
 
 
 def output(model: LinearModel, record: Record, ahead: int | None) -> Array:
-    """Output (T, ny) simulated, or predicted so far ahead; without K a simulation predicts, too."""
+    """Output (T, ny), predicted ``ahead`` samples ahead; simulated without ``ahead`` or K."""
     if ahead is None or model.K is None:
         return model.simulate(record)
     return model.to_model().predict(without_coordinates(record), horizon=ahead)

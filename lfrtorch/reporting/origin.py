@@ -16,7 +16,7 @@ from lfrtorch.data.records import Record
 
 
 def origin(dataset: Dataset) -> dict[str, Any]:
-    """Machine, git state and checksums of the records, for ``metrics.json``."""
+    """Machine, git state and checksums of the records for ``metrics.json``."""
     records = (*dataset.train, *dataset.validation, *dataset.selection, *dataset.tests)
     return {
         "machine": {
@@ -31,7 +31,7 @@ def origin(dataset: Dataset) -> dict[str, Any]:
 
 
 def checksum(record: Record) -> str:
-    """SHA-256 of a record: its shapes and rate, and all its signals as float64."""
+    """SHA-256 of a record's shapes, rate, and signals as float64."""
     found = sha256(f"{record.u.shape} {record.y.shape} {record.fs!r}".encode())
     signals = [record.u, record.y]
     if record.reference is not None:

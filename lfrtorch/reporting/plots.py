@@ -35,21 +35,21 @@ from lfrtorch.data.metrics import rms
 from lfrtorch.data.records import Record
 from lfrtorch.fitting.trainer import Progress
 
-_DPI = 150  # of a figure that is written
-_MOST_POINTS = 20_000  # samples drawn of a long signal
-_FAR = 10.0  # deviations of the output up to which errors are counted in their distribution
-_TAIL = 0.95  # part of the samples whose errors are no larger than the number in the legend
-_BEYOND = 1.0  # ranges of the measured output that are drawn beyond it, if a model runs away
+_DPI = 150  # resolution of figures in files
+_MOST_POINTS = 20_000  # a longer signal is drawn with so many points
+_FAR = 10.0  # errors beyond so many standard deviations of the output are left out
+_TAIL = 0.95  # part of the samples with errors up to the number in the legend
+_BEYOND = 1.0  # if a model runs away, axes end at so many ranges of the output beyond it
 
 Simulated = Mapping[str, Array]
-"""Outputs by the name of their model; a linear one's begins with ``linear``."""
+"""Outputs by the name of their model; names of linear models begin with ``linear``."""
 
 COLOURS = tuple(colour for colour in CHANNELS if colour != LINEAR)
-"""Colours of the nonlinear models, which are also the most in a figure."""
+"""Colours of the nonlinear models; a figure has at most so many of them."""
 
-_HEIGHT = 4.2  # of an output in a figure, in inches
-_INPUTS, _MOST_INPUTS = 1.6, 5  # height of the inputs above, and how many are drawn
-_WIDE, _NARROW = 6.4, 4.4  # of figures that stand side by side on a wide page
+_HEIGHT = 4.2  # height of the panels of an output, in inches
+_INPUTS, _MOST_INPUTS = 1.6, 5  # height of the inputs' panel, and how many are drawn at most
+_WIDE, _NARROW = 6.4, 4.4  # widths of figures that stand side by side on a wide page
 
 
 def is_whole(record: Record) -> bool:
@@ -58,7 +58,7 @@ def is_whole(record: Record) -> bool:
 
 
 def spectrum(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
-    """Draw magnitudes of the measured output and of the errors, one panel an output."""
+    """Draw magnitudes of the measured output and of the errors, a panel for each output."""
     figure, axes = _panels(record, outputs)
     y = record.y[record.skip :]
     f = np.fft.rfftfreq(len(y), 1.0 / record.fs)
@@ -73,7 +73,7 @@ def spectrum(record: Record, simulated: Simulated, outputs: Sequence[int] | None
 
 
 def density(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
-    """Draw spectral densities by Welch of output and errors, if periods are not whole."""
+    """Draw spectral densities of output and errors by Welch's method, if periods are not whole."""
     figure, axes = _panels(record, outputs)
     for i, ax in axes.items():
         for signal, label, colour, style in _signals(record, simulated, i):
@@ -90,7 +90,7 @@ def density(record: Record, simulated: Simulated, outputs: Sequence[int] | None 
 
 
 def response(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
-    """Draw outputs and below them errors against time; the stretch of the close-up is grey."""
+    """Draw outputs and errors over time; the stretch of the close-up is grey."""
     whole = slice(0, record.samples - record.skip)
     figure = _overlay(record, simulated, outputs, whole, _WIDE, fits=True)
     near = _worst_stretch(record, simulated, outputs)
@@ -109,7 +109,7 @@ def close_up(
     *,
     band: Band | None = None,
 ) -> Figure:
-    """Draw the response about the largest error of the first model that is not linear."""
+    """Draw the response near the largest error of the first nonlinear model."""
     near = _worst_stretch(record, simulated, outputs)
     figure = _overlay(record, simulated, outputs, near, _NARROW, band=band)
     figure.suptitle(f"{record.name}: about the largest error", fontsize="medium")
@@ -119,9 +119,9 @@ def close_up(
 def _worst_stretch(
     record: Record, simulated: Simulated, outputs: Sequence[int] | None = None
 ) -> slice:
-    """Some periods of the output about the largest error, from the first scored sample on."""
-    # Errors are those of the first model that is not linear, over the deviation of each output. If
-    # it runs away, this is about where it begins.
+    """Some periods of the output near the largest error, counted from the first scored sample."""
+    # Errors are those of the first nonlinear model, over the standard deviation of each output. If
+    # this model runs away, the stretch is where that begins.
     columns = list(range(record.y.shape[1]) if outputs is None else outputs)
     y = record.y[record.skip :, columns]
     first = next((name for name in simulated if not _is_linear(name)), next(iter(simulated)))
@@ -133,7 +133,7 @@ def _worst_stretch(
     above = y[:, column] > np.mean(y[:, column])
     swings = max(1, np.count_nonzero(above[1:] != above[:-1])) / 2
     least, most = (50, 2000)
-    # Eight periods, and no more than a quarter of a longer record.
+    # The stretch has eight periods, but at most a quarter of a longer record.
     length = min(8 * len(y) / swings, most, 0.25 * len(y))
     length = min(len(y), max(least, int(length)))
     begin = max(0, min(int(row) - length // 2, len(y) - length))
@@ -143,7 +143,7 @@ def _worst_stretch(
 def distribution(
     record: Record, simulated: Simulated, outputs: Sequence[int] | None = None
 ) -> Figure:
-    """Draw densities of the errors; the legend has the range of 95 % of the samples."""
+    """Draw densities of the errors; the legend gives the range of 95 % of the samples."""
     figure, axes = _panels(record, outputs, _NARROW, sharex=False)
     figure.suptitle(f"{record.name}: errors", fontsize="medium")
     for i, ax in axes.items():
@@ -170,7 +170,7 @@ def distribution(
 
 
 def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Figure:
-    """Draw errors on training and validation against iteration, the kept iterate marked."""
+    """Draw training and validation errors over the iterations, with a mark at the kept iterate."""
     figure, ((ax,),) = panels((7, 4))
     iterations = [p.iteration for p in history]
     train, validation = np.array([(p.train, p.validation) for p in history]).T
@@ -194,7 +194,7 @@ def png(figure: Figure) -> bytes:
 
 
 def save(figures: Mapping[str, Figure], folder: Path) -> dict[str, bytes]:
-    """Write figures by name as PNG files into a folder, and return these."""
+    """Write figures by name as PNG files into a folder, and return the files' contents."""
     images = {name: png(figure) for name, figure in figures.items()}
     for name, image in images.items():
         with whole_file(folder / f"{name}.png") as fresh:
@@ -223,7 +223,7 @@ def _overlay(
     band: Band | None = None,
 ) -> Figure:
     """Measured and simulated outputs of a part of the scored samples, and the errors below."""
-    # With ``fits`` the inputs stand above, as what the outputs answer to.
+    # With ``fits``, the inputs are drawn above, as the outputs respond to them.
     numbers = list(range(record.y.shape[1]) if outputs is None else outputs)
     height = _HEIGHT * len(numbers) + _INPUTS * fits
     ratios = [1] * fits + [2, 1] * len(numbers)
@@ -287,7 +287,7 @@ def _fit_text(y: Array, y_hat: Array) -> str:
 
 
 def _signals(record: Record, simulated: Simulated, i: int) -> list[tuple[Array, str, str, str]]:
-    """Output and errors, label, colour, style; of a model that diverges the label alone."""
+    """Output, errors, label, colour and style of each model; only a label if it diverges."""
     y = record.y[record.skip :, i]
     signals = [(y, "output", OUTPUT, "-")]
     for name, colour, style in _drawn(simulated):
@@ -312,7 +312,7 @@ def _drawn(simulated: Simulated) -> list[tuple[str, str, str]]:
 
 
 def envelope(t: Array, signal: Array) -> tuple[Array, Array]:
-    """A long signal as the smallest and largest sample of each of many short stretches."""
+    """The smallest and largest samples of many short stretches of a long signal."""
     stretch = len(signal) // (_MOST_POINTS // 2)
     if stretch < 2:
         return t, signal
@@ -326,6 +326,6 @@ def _frequency_axis(record: Record, ax: Axes) -> None:
 
 
 def _decibel(signal: Array) -> Array:
-    """Amplitude of each line of a real signal in dB; a silent line shows as the rounding error."""
+    """Amplitude of each line of a real signal in dB; finite for a line of exactly 0."""
     amplitude = np.abs(np.fft.rfft(signal)) * 2.0 / len(signal)
     return 20.0 * np.log10(np.maximum(amplitude, np.finfo(float).tiny))

@@ -1,4 +1,4 @@
-"""A first look at a record before any fit: numbers of its signals, what will hurt, a figure."""
+"""A first look at a record before any fit: numbers of its signals, faults, and a figure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """Preview of a file by ``lfrtorch preview``; ``print`` has the numbers and the notes.
+    """Preview of a record, as by ``lfrtorch preview``; ``print`` shows the numbers and the notes.
 
     Args:
         survey: the numbers of each signal.
@@ -51,7 +51,7 @@ def preview(record: Record) -> Preview:
     """Look at a record before any fit.
 
     Args:
-        record: its outputs may lack values, which count as missing.
+        record: record with inputs and outputs; outputs that are not valid count as missing.
 
     Example:
         >>> found = lfrtorch.preview(record[:200])
@@ -59,7 +59,7 @@ def preview(record: Record) -> Preview:
         200 samples are few to fit...
         >>> found.figure.savefig("preview.png")
     """
-    from lfrtorch.reporting.survey_plots import survey_figure  # and matplotlib with it
+    from lfrtorch.reporting.survey_plots import survey_figure  # slow: imports matplotlib
 
     y = np.where(record.valid, record.y, np.nan) if record.valid is not None else record.y
     survey = survey_measurement(
@@ -69,7 +69,7 @@ def preview(record: Record) -> Preview:
     if record.start == "zero" and survey.inputs and record.period is None:
         try:
             trial = try_starts(record)
-        except ValueError:  # no linear model tells how it begins
+        except ValueError:  # too short, or too little excitation
             trial = None
         if trial is not None and trial.in_motion:
             notes.append(f"{trial}, and the record has start 'zero'")

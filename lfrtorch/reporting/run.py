@@ -1,4 +1,4 @@
-"""All that an identification found."""
+"""The results of an identification."""
 
 from __future__ import annotations
 
@@ -33,15 +33,16 @@ class Run:
         dataset: the records.
         settings: the settings, with the chosen sizes in place of ``"auto"``.
         linear: the best linear approximation of all training records.
-        order_scan, choice: choice of nx and of the other sizes; None if they were given.
-        fit: the nonlinear fit, of the best start or of the mean of several.
-        refit: the fit to all estimation records, if one was asked for. Its model is the run's, and
-            is scored on the tests; training and validation errors are those of ``fit.model``.
+        order_scan, choice: choice of nx and of the other sizes; None for sizes that were given.
+        fit: the nonlinear fit: the best start, or the mean of several starts.
+        refit: the fit to all estimation records, if ``settings`` ask for it. Its model is
+            ``run.model``, and is scored on the tests; training and validation errors are those of
+            ``fit.model``.
         evaluation: both models on every record.
         residuals: analysis of the record with the largest error, as the report shows it.
-        parameters: parameters of the known model, if the settings have one.
-        memory: result of the test if the simulation forgets its start; None for predictions and
-            windows.
+        parameters: parameters of the known model, if the settings contain a known model.
+        memory: result of the test whether the simulation forgets its start; None if predictions or
+            windows were fitted.
         metrics: contents of ``metrics.json``: scores by record, sizes, the fit in numbers.
         verdict: comparison of the NL-LFR with the linear model.
         advice: next steps, the most useful first.
@@ -81,12 +82,12 @@ class Run:
 
     @property
     def simulations(self) -> list[Response]:
-        """Every record with both simulations."""
+        """The responses of both models to every record."""
         return self.evaluation.simulations
 
     @property
     def origins(self) -> list[str]:
-        """Use of the best starts, if the model is not simply one of them."""
+        """Sentences on the origin of the model, if it is not simply the best start."""
         mean = f"The model is the mean of the best {self.fit.averaged} starts."
         again = "Refitted to all estimation records: validation errors are those before it."
         return [mean] * (self.fit.averaged > 1) + [again] * (self.refit is not None)
@@ -129,7 +130,7 @@ class Run:
         return "\n".join(parts)
 
     def _metrics(self) -> dict[str, Any]:
-        # A model fitted again is scored on the tests; validation errors are those before it.
+        # A refitted model is scored on the tests; validation errors are those before the refit.
         fit, refit, dataset = self.fit, self.refit, self.dataset
         entries = scores.scored(self.evaluation)
         entries["data"] |= {

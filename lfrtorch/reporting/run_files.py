@@ -22,19 +22,20 @@ def write(
     draw: bool = True,
     board: TensorBoard | None = None,
 ) -> None:
-    """Write the files of a run into a folder, which is made if it is missing.
+    """Write the files of a run into a folder; make the folder if it is missing.
 
     ``model/`` and ``linear/`` are checkpoints for :func:`lfrtorch.load` and
-    ``LinearModel.load``; ``figures/`` has the figures, ``report.html`` them and the numbers, and
-    ``metrics.json`` the numbers: it is written last. ``tensorboard --logdir FOLDER`` shows the
-    history.
+    ``LinearModel.load``. ``figures/`` contains the figures, ``report.html`` figures and numbers,
+    and ``metrics.json``, which is written last, the numbers. ``tensorboard --logdir FOLDER`` shows
+    the history.
 
     Args:
         run: result of :func:`lfrtorch.identify`.
-        folder: folder of the files; those of an earlier run there are replaced.
-        command, config: that made the run, for ``metrics.json`` and ``report.html``.
+        folder: folder of the files; files of an earlier run there are replaced.
+        command, config: command line and settings of the run, for ``metrics.json`` and
+            ``report.html``.
         draw: make figures and ``report.html``.
-        board: TensorBoard, with the history if it has begun. Default: a new one.
+        board: TensorBoard that has the history, if it has begun. Default: a new one.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Columns of the tables of scores: each is declared once, for a terminal and for the report."""
+"""Columns of the tables of scores, each declared once for the terminal and the report."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from lfrtorch.data.records import common_unit, of_one_unit
 from lfrtorch.reporting.evaluation import CROSS, Score, finite
 
 ALL = "all"
-"""Name of several outputs together."""
+"""Name of all outputs together."""
 
 USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
 """Words of the report for the uses of records."""
 
 
 def use_of(use: str, record: str) -> str:
-    """Use of a record; the left out parts of a cross-validation chose nothing."""
+    """Use of a record in words; stretches of cross-validation were "left out in turn"."""
     return "left out in turn" if record.endswith(CROSS) else USES.get(use, use)
 
 
 class Row(NamedTuple):
     """Errors on a record or a group of records, of one output or of all together."""
 
-    key: str  # by which publications name it; the record's own in the first of its rows
+    key: str  # name in publications; the name of the record in its first row
     record: str
     score: Score
     output: str
     unit: str
     linear: float | None
-    error: float | None = None  # of the NL-LFR; nan if it diverges
-    std: float = math.nan  # of the measured output
-    factor: float = 1.0  # of the errors, for the unit
+    error: float | None = None  # error of the NL-LFR; nan if it diverges
+    std: float = math.nan  # standard deviation of the measured output
+    factor: float = 1.0  # errors times this factor are in the unit of the row
 
     @property
     def ratio(self) -> float:
@@ -52,7 +52,7 @@ class Row(NamedTuple):
 
 
 class _Column(NamedTuple):
-    """A column of scores: the tables that have it, and its cell, None or empty if it has none."""
+    """A column of scores: its head, the tables that contain it, and a function for its cells."""
 
     head: str
     where: str
@@ -60,13 +60,13 @@ class _Column(NamedTuple):
 
 
 def _error(row: Row) -> tables.Cell:
-    """The NL-LFR's error, or that it diverges."""
+    """The NL-LFR's error, or the word "diverges"."""
     known = row.error is None or not row.score.scored or math.isfinite(row.error)
     return row.scaled(row.error) if known else "diverges"
 
 
 def _start(row: Row) -> tables.Cell:
-    """Part of the error by the uncertainty of the start, if that matters."""
+    """Part of the error by the uncertainty of the start, if it is large."""
     return row.scaled(row.score.start_error) if row.score.start_matters else None
 
 
@@ -102,7 +102,7 @@ _COLUMNS = (
 def columns(
     where: str, rows: Sequence[Row], *, linear: str = "linear", published: Sequence[Published] = ()
 ) -> tuple[list[str], list[list[tables.Cell]], int]:
-    """Head and cells of the columns that have some, and how many of words come first."""
+    """Head and cells of all columns that are not empty, and the number of columns with words."""
     found = [column for column in _COLUMNS if where in column.where.split()]
     found += [_Column(p.label, where, partial(_published, p)) for p in published]
     found = [c for c in found if any(c.cell(row) not in ("", None) for row in rows)]
@@ -112,7 +112,7 @@ def columns(
 
 
 def rows_of(record: str, score: Score) -> list[Row]:
-    """Errors of all outputs together, if they have one unit, and of each if there are several."""
+    """Rows of a record: all outputs together if they have one unit, and each output if several."""
     together, *each = _every_row(record, score)
     joint = [together] if len(each) > 1 and of_one_unit(score.channels) else []
     first, *others = [*joint, *each]
@@ -120,7 +120,7 @@ def rows_of(record: str, score: Score) -> list[Row]:
 
 
 def named_rows(record: str, score: Score, published: Sequence[Published]) -> list[Row]:
-    """Errors of all outputs together, and of those that published figures name."""
+    """Rows of a record: all outputs together, and each output that published scores name."""
     together, *each = _every_row(record, score)
     named = {key.rpartition(" ")[2] for p in published for key in p.scores if " " in key}
     own = [row._replace(unit=together.unit) for row in each if row.output in named]
@@ -129,7 +129,7 @@ def named_rows(record: str, score: Score, published: Sequence[Published]) -> lis
 
 
 def _every_row(record: str, score: Score) -> list[Row]:
-    """Errors of all outputs together, relative if they have several units, and of each."""
+    """Rows of all outputs together, with relative errors if units differ, and of each output."""
     unknown = [None] * len(score.channels)
     errors = score.lti_rmse_by_output or unknown, score.rmse_by_output or unknown
     unit, joint = common_unit(score.channels), (score.lti_rmse, score.rmse, score.std)
@@ -145,7 +145,7 @@ def _every_row(record: str, score: Score) -> list[Row]:
 
 
 def in_units(rows: Sequence[Row], published: Sequence[Published] = ()) -> list[Row]:
-    """The rows of each unit with its prefix and factor; publications may ask for a prefix."""
+    """The rows with one prefix for each unit; publications may ask for a prefix."""
     values: dict[str, list[float | None]] = {}
     for row in rows:
         values.setdefault(row.unit, []).extend([row.linear, row.error])

@@ -34,10 +34,10 @@ from lfrtorch.reporting.verdict import REMEMBERS, judge, judge_predictions
 
 
 def scored_run(job: Job) -> Run:
-    """Score all records, the tests by the model fitted again; add verdict and advice."""
+    """Score all records, the tests by a refitted model if there is one; add verdict and advice."""
     dataset, settings, linear, result = job.dataset, job.settings, job.linear, job.result
     order_scan, choice, again = job.order_scan, job.choice, job.again
-    in_turn = choice is not None and not dataset.tests  # what was left out judges
+    in_turn = choice is not None and not dataset.tests  # cross-validation judges
     scan = None if in_turn else order_scan
     opposed = linear_opponents(dataset, settings, linear, scan, job.observer)
     samples = sum(record.samples for record in dataset.train)
@@ -117,7 +117,7 @@ def linear_opponents(
     scan: OrderScan | None,
     observer: Observer,
 ) -> Opponents:
-    """The linear models that the NL-LFR is compared with, of the order that a scan chose."""
+    """The linear models that the NL-LFR is compared with, with the order that a scan chose."""
     ahead = () if settings.noise == "output" else HORIZONS
     if begins_at_outputs(dataset.train):
         return dict.fromkeys((None, *ahead), linear)
@@ -126,18 +126,18 @@ def linear_opponents(
     found = opponents(linear, records, dataset, nx=nx, options=settings.linear, ahead=ahead)
     others = {id(model): model for model in found.values() if model is not linear}
     for model in others.values():
-        observer.say("another linear model does better than the start; it is the one compared with")
+        observer.say("another linear model beats the start; the NL-LFR is compared with it")
         tell(model, observer)
     return found
 
 
 def linear_models_of_tests(dataset: Dataset, settings: Settings) -> dict[str, LinearModel]:
-    """Linear models of single tests, if ``dataset.linear`` asks for them, by the test's name."""
+    """Linear models for single tests by the test's name, if ``dataset.linear`` asks for them."""
     options = {**settings.linear}
     if settings.noise == "output" and options.get("refine") == "prediction":
         options["refine"] = None  # simulations are judged
     records = {record.name: record for record in dataset.train}
-    # Tests that share their records share the model.
+    # Tests with the same records share a model.
     of = list(dict.fromkeys(dataset.linear.values()))
     estimate = partial(estimate_bla, nx=cast(int, of_linear_model(settings).nx), **options)
     models = each_alone(estimate, [[records[name] for name in names] for names in of])

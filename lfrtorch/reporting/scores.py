@@ -1,4 +1,4 @@
-"""Scores of a run: an entry for each test record or group, as a table and as JSON."""
+"""Scores of a run, with an entry for each test record or group, as a table and as JSON."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from lfrtorch.reporting.evaluation import HORIZONS, Evaluation, finite
 from lfrtorch.reporting.score_columns import ALL, columns, in_units, named_rows, rows_of
 
 ERRORS = "rmse", "lti_rmse"
-"""Entries of a score in the unit of the outputs: of the NL-LFR and of the linear model."""
+"""Entries of a score in the unit of the outputs: errors of the NL-LFR and the linear model."""
 
 ESTIMATION = "validation", "selection"
-"""Uses of records that choose, and are not fitted."""
+"""Uses of records that choose among models, and are not fitted."""
 
-_MOST_ROWS = 24  # of outputs on the terminal; the report has all
+_MOST_ROWS = 24  # a longer table of outputs is only in the report
 
 
 def scored(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
-    """Scores of a model, and of a linear one if there is one: ``metrics.json`` without a fit."""
+    """Scores of a model, and of a linear model if there is one, as in ``metrics.json``."""
     dataset, bla = evaluation.dataset, evaluation.linear
     model = evaluation.refitted or evaluation.model
     assert model is not None
@@ -59,14 +59,14 @@ def scored(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
 
 
 def _pooled(evaluation: Evaluation, error: str) -> float | None:
-    """RMSE over the validation records, each with the weight of its scored samples."""
+    """RMSE over all scored samples of the validation records."""
     scores = [r.score for r in evaluation.simulations if r.use == "validation"]
     squares = [s.scored * e**2 for s in scores if (e := getattr(s, error)) is not None]
     return (sum(squares) / sum(s.scored for s in scores)) ** 0.5 if squares else None
 
 
 def _predicted(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
-    """RMSE of predictions by record: use, and errors of both models at each of ``HORIZONS``."""
+    """Entries by record: its use, and the RMSE of both models' predictions at ``HORIZONS``."""
     found: dict[str, dict[str, Any]] = {}
     for use in ("test", "validation"):
         for horizon, responses in evaluation.predictions.items():
@@ -82,9 +82,9 @@ def _predicted(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
 
 def table(
     evaluation: Evaluation,
-    averaged: int = 1,  # models that ours is the mean of
+    averaged: int = 1,  # number of models whose mean our model is
 ) -> str:
-    """Our linear model and NL-LFR beside the published ones, in one unit; tests come first."""
+    """Table of errors of our models and of published models, in one unit; tests come first."""
     model, published = evaluation.refitted or evaluation.model, evaluation.dataset.published
     assert model is not None
     others = [p for p in published if p.sizes in (None, (model.sizes["nz"], model.sizes["nw"]))]
@@ -113,14 +113,14 @@ def table(
     parts += ["\n".join(references)] * bool(references)
     several = [row for name, s in (tests or chosen_on).items() for row in rows_of(name, s)]
     several = [r for r in several if len(r.score.channels) > 1 and r.output != ALL]
-    if 0 < len(several) <= _MOST_ROWS:  # a row a record is what the table above has
+    if 0 < len(several) <= _MOST_ROWS:  # the table above has a row for each record
         head, cells, _ = columns("outputs", several, linear=linear_name(evaluation))
         parts += ["RMSE of each output", tables.table(head, cells)]
     return "\n\n".join([*parts, *_prediction_table(evaluation), *_sums_table(evaluation)])
 
 
 def _prediction_table(evaluation: Evaluation) -> list[str]:
-    """Errors of predictions, a line a record and model; nothing without them."""
+    """Table of prediction errors, with a line for each record and model; empty without them."""
     listed = _predicted(evaluation)
     if not listed:
         return []
@@ -139,7 +139,7 @@ def _prediction_table(evaluation: Evaluation) -> list[str]:
 
 
 def _sums_table(evaluation: Evaluation) -> list[str]:
-    """Errors summed over the samples of a horizon, a line a record and measure; or nothing."""
+    """Table of errors summed over a horizon, a line for each record and measure; may be empty."""
     published = evaluation.dataset.published
     names = "hold", "linear", "NL-LFR"
     rows: list[list[tables.Cell]] = [
@@ -166,22 +166,26 @@ def _in_brackets(unit: str) -> str:
 
 
 def linear_name(evaluation: Evaluation) -> str:
-    """The linear model with its order, which may differ from run to run."""
+    """The name of the linear model with its order, which may differ from run to run."""
     return "linear" if evaluation.linear is None else f"linear (nx {evaluation.linear.nx})"
 
 
 def own_linear(evaluation: Evaluation) -> list[str]:
-    """Tests with a linear model of their own, and the records of these."""
+    """A line on the tests that have their own linear models, and the records of each model."""
     linear = {name: evaluation.dataset.linear[name] for name in evaluation.own}
     models = [
-        f"{name} of {'+'.join(of) if len(of) <= LISTED else f'{len(of)} training records'}"
+        f"{name} from {'+'.join(of) if len(of) <= LISTED else f'{len(of)} training records'}"
         for name, of in linear.items()
     ]
-    return [f"linear: a model for each of these: {', '.join(models)}"] if models else []
+    return [f"linear: each of these has its own model: {', '.join(models)}"] if models else []
 
 
 def in_words(sizes: Mapping[str, int], known_states: int = 0, averaged: int = 1) -> str:
+<<<<<<< HEAD
     """The sizes of a model in words."""
+=======
+    """The sizes of a model in words."""
+>>>>>>> 047f253 (Say reports, commands and settings in sentences that are read once)
     if averaged > 1:
         return f"mean of {averaged} models, together {in_words(sizes, known_states)}"
     if known_states:
@@ -194,9 +198,15 @@ def in_words(sizes: Mapping[str, int], known_states: int = 0, averaged: int = 1)
     return f"nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {kind}"
 
 
+<<<<<<< HEAD
 def starts_table(result: FitResult, names: Sequence[str], unit: str = "") -> str:
     """The starts of a fit that went to the end, and how many others there were."""
     unit, head, rows, others = starts(result, names, unit)
+=======
+def starts_table(result: FitResult, names: Sequence[str], unit: str = "") -> str:
+    """Table of the starts of a fit that ran to the end, and the number of the others."""
+    unit, head, rows, others = starts(result, names, unit)
+>>>>>>> 047f253 (Say reports, commands and settings in sentences that are read once)
     title = f"Starts, RMSE of the best iterate of each{_in_brackets(unit)}"
     return "\n\n".join(part for part in (title, tables.table(head, rows), others) if part)
 
@@ -204,7 +214,7 @@ def starts_table(result: FitResult, names: Sequence[str], unit: str = "") -> str
 def starts(
     result: FitResult, names: Sequence[str], unit: str
 ) -> tuple[str, list[str], list[list[tables.Cell]], str]:
-    """Unit, head and rows of the starts that no others ended, the best first, and of the others."""
+    """Unit, head and rows of the starts that ran to the end, and a sentence on the others."""
     ended = [start for start in result.starts if start.reason != Reason.OTHERS_BETTER]
     errors = [(start.train, start.validation, start.selection) for start in ended]
     factor, unit = tables.engineering([e for each in errors for e in each], unit)
@@ -219,7 +229,7 @@ def starts(
 
 
 def stability(stable_to: float) -> str:
-    """Amplitude margin of the training inputs."""
+    """A sentence on the amplitude up to which the model is stable on the training inputs."""
     tried = ", ".join(f"{factor:g}" for factor in LOUDER)
     if stable_to >= max(LOUDER):
         return (

@@ -1,4 +1,4 @@
-"""Steps of several heights: where a model is linear, they all have one shape."""
+"""Responses to steps of several heights: if a model is linear, all have the same shape."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from lfrtorch.data.records import Record
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.model import Model
 
-_MOST = 3  # inputs and outputs that are drawn
-_HEIGHTS = (-1.0, -0.5, 0.5, 1.0)  # parts of the way to where the training inputs seldom go
-_SELDOM = 2.0  # per cent of the samples beyond that
-_LEFT = 0.02  # of a step, when it has settled
-_DRIFT = 0.15  # of a step, in its last quarter, where it is not settled
-_STILL = 1e-3  # of an output's deviation, below which it does not move
-_FEWEST, _LONGEST = 20, 10_000  # samples of a step
+_MOST = 3  # at most so many inputs and outputs are drawn
+_HEIGHTS = (-1.0, -0.5, 0.5, 1.0)  # heights, relative to the largest step that is drawn
+_SELDOM = 2.0  # per cent of the training inputs are beyond the largest step
+_LEFT = 0.02  # part of a step that is left when the response has settled
+_DRIFT = 0.15  # change in the last quarter, over the step, of a response that has not settled
+_STILL = 1e-3  # part of an output's standard deviation below which the output does not move
+_FEWEST, _LONGEST = 20, 10_000  # smallest and largest number of samples of a step
 
 
 def steps(model: Model, linear: LinearModel, records: list[Record]) -> Figure:
@@ -67,7 +67,7 @@ def steps(model: Model, linear: LinearModel, records: list[Record]) -> Figure:
 
 
 def _settling(linear: LinearModel, most: int) -> int:
-    """Samples until the slowest pole has come to 2 % of its step."""
+    """Samples until 2 % of the step are left in the response of the slowest pole."""
     radius = float(np.abs(linear.poles).max(initial=0.0))
     if not radius < 1.0:
         raise InputError("the linear model does not come to rest: it has no step to show.")
@@ -78,7 +78,7 @@ def _settling(linear: LinearModel, most: int) -> int:
 def _step(
     model: Model | LinearModel, rest: Array, j: int, height: float, settled: int, still: Array
 ) -> Array:
-    """Change of the outputs (settled, ny) after input j has gone up; before, all were at rest."""
+    """Change of the outputs (settled, ny) after a step of input j from rest."""
     u = np.tile(rest, (4 * settled, 1))
     u[3 * settled :, j] += height
     y = model.simulate(u)

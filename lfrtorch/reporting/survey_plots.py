@@ -15,7 +15,7 @@ from lfrtorch.survey.signal import LEAST, SignalSurvey, longest_run
 
 
 def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
-    """Draw each of the signals (T, nu + ny), its values, and its spectrum with the band."""
+    """Draw each signal (T, nu + ny) over time, its distribution, and its spectrum with the band."""
     rows = len(found.signals)
     widths = [3.2, 0.8, 2.6]
     figure, grid = panels((13, 1.2 + 2.0 * rows), rows, 3, sharex="col", width_ratios=widths)
@@ -54,7 +54,7 @@ def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
 
 
 def _spectrum(ax: Axes, one: SignalSurvey, signal: Array, fs: float, colour: str) -> None:
-    """Amplitude in dB against frequency of the longest part without gaps; its band in grey."""
+    """Draw the spectrum in dB of the longest part without gaps, with the signal's band in grey."""
     unit = one.channel.unit
     ax.set_ylabel(f"dB, re 1 {unit}" if unit else "dB")
     ax.grid(True, which="major", alpha=0.2)
@@ -63,7 +63,7 @@ def _spectrum(ax: Axes, one: SignalSurvey, signal: Array, fs: float, colour: str
         return
     part = signal[first : first + length]
     f, power = scipy.signal.periodogram(part, fs, window="hann", scaling="spectrum")
-    # The largest line of each stretch is drawn.
+    # In each stretch of the axis, the largest line is drawn.
     edges = np.geomspace(f[1], f[-1], 3000)
     starts = np.unique(np.searchsorted(f, edges[edges <= f[-1]]))
     level = 10 * np.log10(np.maximum(2 * np.maximum.reduceat(power, starts), 1e-300))

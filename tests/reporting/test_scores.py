@@ -110,7 +110,7 @@ def test_a_test_may_have_a_linear_model_of_its_own(result):
     assert metrics["scores"]["test"]["lti_rmse"] == expected
     assert metrics["linear"] == {"test": ["train"]}
     text = report.table(evaluation)
-    assert "linear: a model for each of these: test of train\n" in text
+    assert "linear: each of these has its own model: test from train\n" in text
 
 
 def test_metrics_are_what_the_model_scores(result):
