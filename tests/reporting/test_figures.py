@@ -80,7 +80,7 @@ def test_the_captions_say_what_the_bands_are_and_what_speaks_against_them():
     settings = lfrtorch.Settings(nx=1, nz=1, nn=3, starts=1)
     run = lfrtorch.identify(Dataset("lab", [record]), settings)
     drawn, views = figures.of_run(run)
-    assert "where 95 % of the errors are" in views["a"]["a_near"]
+    assert "contains 95 % of the errors" in views["a"]["a_near"]
     assert {"a_near", "steps", "static_map"} <= {*drawn}
     run = replace(run, settings=replace(run.settings, horizon=20))  # fitted in windows: no bands
     assert "95 %" not in figures.of_run(run)[1]["a"]["a_near"]
