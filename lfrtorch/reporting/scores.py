@@ -181,11 +181,7 @@ def own_linear(evaluation: Evaluation) -> list[str]:
 
 
 def in_words(sizes: Mapping[str, int], known_states: int = 0, averaged: int = 1) -> str:
-<<<<<<< HEAD
     """The sizes of a model in words."""
-=======
-    """The sizes of a model in words."""
->>>>>>> 047f253 (Say reports, commands and settings in sentences that are read once)
     if averaged > 1:
         return f"mean of {averaged} models, together {in_words(sizes, known_states)}"
     if known_states:
@@ -198,15 +194,9 @@ def in_words(sizes: Mapping[str, int], known_states: int = 0, averaged: int = 1)
     return f"nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {kind}"
 
 
-<<<<<<< HEAD
-def starts_table(result: FitResult, names: Sequence[str], unit: str = "") -> str:
-    """The starts of a fit that went to the end, and how many others there were."""
-    unit, head, rows, others = starts(result, names, unit)
-=======
 def starts_table(result: FitResult, names: Sequence[str], unit: str = "") -> str:
     """Table of the starts of a fit that ran to the end, and the number of the others."""
     unit, head, rows, others = starts(result, names, unit)
->>>>>>> 047f253 (Say reports, commands and settings in sentences that are read once)
     title = f"Starts, RMSE of the best iterate of each{_in_brackets(unit)}"
     return "\n\n".join(part for part in (title, tables.table(head, rows), others) if part)
 
