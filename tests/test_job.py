@@ -457,7 +457,7 @@ def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFi
     [
         ({"nx": None}, "nx, the number of states, is not set"),
         ({"degree": np.zeros(3)}, "degree is array([0., 0., 0.]); give"),
-        ({"degree": "auto"}, "degree is auto, and this static map has none; give nn='auto'"),
+        ({"degree": "auto"}, "degree is auto, but this static map has no degree; give nn='auto'"),
         ({"static": "spline"}, "static is 'spline'"),
         ({"static": -1}, "static is -1"),
         ({"init": "magic"}, "init is 'magic'"),

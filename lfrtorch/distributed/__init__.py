@@ -1,4 +1,4 @@
-"""Several processes that share one fit, see ``processes``."""
+"""Several processes that share one fit; see ``processes``."""
 
 from lfrtorch.distributed.processes import (
     ProcessGroup,

@@ -1,11 +1,13 @@
-"""Several processes that share one fit, its starts or its records, by ``torch.distributed``.
+"""Several processes that share the starts or the records of one fit, by ``torch.distributed``.
 
     torchrun --nproc-per-node 2 script.py
 
-The script has ``with connect(): fit(...)``: gloo between CPUs, NCCL between GPUs. Inside,
-``current()`` has the processes. ``Ranks.sharing_records`` decides if starts or records are shared.
-All processes take the same steps, since every decision uses a sum over all of them, or the number
-of the first one: rounding errors differ between processors, and a search lets them grow.
+The script contains ``with connect(): fit(...)``. CPUs exchange data by gloo, GPUs by NCCL. Inside
+the context, ``current()`` returns the processes. ``Ranks.sharing_records`` decides whether starts
+or records are shared.
+
+All processes take the same steps: every decision uses a sum over all processes, or the number of
+the first process. Rounding errors differ between processors, and a search would let them grow.
 """
 
 from __future__ import annotations
@@ -27,11 +29,11 @@ from lfrtorch._support.reasons import Reason, told
 
 Shared = TypeVar("Shared")
 
-_AXES = 8  # most axes of a tensor that is sent
+_AXES = 8  # largest number of axes of a tensor that is sent
 
 
 class ProcessLostError(LfrtorchError, RuntimeError):
-    """Error of a process whose partner ended, or did not answer in time."""
+    """Another process ended, or did not answer in time."""
 
     def __init__(self, detail: str) -> None:
         super().__init__(told(Reason.PROCESS_LOST, detail))
@@ -39,7 +41,7 @@ class ProcessLostError(LfrtorchError, RuntimeError):
 
 
 class Ranks:
-    """Single process that holds all records; ``ProcessGroup`` is several.
+    """A single process that holds all records; the subclass ``ProcessGroup`` is several processes.
 
     Example:
         >>> ranks = lfrtorch.distributed.Ranks()
@@ -50,31 +52,31 @@ class Ranks:
     rank, world = 0, 1
 
     def share(self, items: list[Shared]) -> list[Shared]:
-        """Items of this process: every ``world``-th."""
+        """Items of this process: every ``world``-th item, from its rank on."""
         return items[self.rank :: self.world]
 
     def sharing_records(self, starts: int) -> Ranks:
-        """Processes that share the records of each start: one, if they share the starts."""
+        """Processes that share the records of each start: this one alone if starts are shared."""
         return Ranks() if 1 < self.world <= starts else self
 
     def enough_for(self, items: int) -> Ranks:
-        """Processes for a number of items: all, or each alone if there are fewer items."""
+        """Processes that share items: all, or this one alone if there are fewer items."""
         return self if items >= self.world else Ranks()
 
     def sum(self, part: Tensor) -> Tensor:
-        """Sum of all processes' parts, on each of them."""
+        """Sum of the parts of all processes, on each process."""
         return part
 
     def stack(self, part: Tensor) -> Tensor:
-        """Rows of all processes' parts, which may differ in number, on each of them."""
+        """Rows of the parts of all processes, on each process; the parts may differ in length."""
         return part
 
     def first(self, part: Tensor) -> Tensor:
-        """Part of the first process, of any shape, on each of them."""
+        """Part of the first process, of any shape, on each process."""
         return part
 
     def close(self) -> None:
-        """Leave the other processes: their next exchange ends in a ``ProcessLostError``."""
+        """Leave the other processes; their next exchange raises a ``ProcessLostError``."""
 
     def __enter__(self) -> Self:
         _CURRENT.append(self)
@@ -86,11 +88,11 @@ class Ranks:
 
 
 _CURRENT = [Ranks()]
-"""Stack of processes: the last ones work together now, the others wait for them."""
+"""Stack of groups of processes: the last group works now, the groups before it wait."""
 
 
 def current() -> Ranks:
-    """Processes that work together now: those of the last ``connect``, or this one alone.
+    """Processes that work together now: those of ``connect`` or ``using``, or this one alone.
 
     Example:
         >>> lfrtorch.distributed.current().world
@@ -101,7 +103,7 @@ def current() -> Ranks:
 
 @contextmanager
 def using(ranks: Ranks | None) -> Iterator[Ranks]:
-    """Let other processes work together in a context; None changes nothing.
+    """Make ``ranks`` the processes that work together in a context; None changes nothing.
 
     Example:
         >>> with lfrtorch.distributed.using(lfrtorch.distributed.Ranks()) as alone:
@@ -116,7 +118,7 @@ def using(ranks: Ranks | None) -> Iterator[Ranks]:
 
 
 def agreed(part: Tensor) -> Tensor:
-    """Numbers of the first process, on each of those that work together.
+    """Numbers of the first process, on all processes that work together.
 
     Example:
         >>> lfrtorch.distributed.agreed(torch.ones(2))
@@ -129,7 +131,7 @@ def connect(device: str | torch.device = "cpu", timeout: float = 600.0) -> Ranks
     """Context of the processes that torchrun started, or of a single process.
 
     Args:
-        device: device of the model: ``"cpu"``, or ``"cuda"`` for each process its own GPU.
+        device: device of the model: ``"cpu"``, or ``"cuda"``, where each process has its own GPU.
         timeout: seconds after which a process that does not answer counts as lost. It should be
             much longer than the slowest share of an iteration.
 
@@ -149,7 +151,7 @@ def connect(device: str | torch.device = "cpu", timeout: float = 600.0) -> Ranks
         return Ranks()
     gpu = None
     if torch.device(device).type == "cuda":
-        # A failed collective is an exception here, where NCCL's own watchdog would abort.
+        # A failed collective then raises an exception; NCCL's own watchdog would abort.
         os.environ.setdefault("TORCH_NCCL_BLOCKING_WAIT", "1")
         gpu = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         torch.cuda.set_device(gpu)
@@ -166,15 +168,15 @@ class ProcessGroup(Ranks):
     """Processes of torch's default group.
 
     Args:
-        device: device of its backend.
+        device: device of the group's backend.
 
     Raises:
-        ProcessLostError: a process ended, or did not answer in time; from any of the methods.
+        ProcessLostError: in any method, if a process ended or did not answer in time.
     """
 
     def __init__(self, device: str | torch.device = "cpu") -> None:
         self.rank, self.world = dist.get_rank(), dist.get_world_size()
-        self._device = torch.device(device)  # the timeout of the backend
+        self._device = torch.device(device)
 
     def sum(self, part: Tensor) -> Tensor:
         """Sum of all parts."""
@@ -219,13 +221,13 @@ class ProcessGroup(Ranks):
     def _call(self, collective: Callable[[], object]) -> None:
         try:
             collective()
-        except RuntimeError as error:  # the backend has errors of any kind
+        except RuntimeError as error:  # the backends raise many kinds of errors
             other = f"rank {1 - self.rank}" if self.world == 2 else "one of the others"
             seen = f"rank {self.rank} of {self.world} has no answer from {other}"
             raise ProcessLostError(f"{seen} ({_gist(error)})") from error
 
 
 def _gist(error: Exception) -> str:
-    """Message of a backend without its source file and its advice."""
+    """Message of a backend, without the source file and the advice in it."""
     text = re.sub(r"^\[[^]]*\]\s*", "", str(error))
     return text.split(". ")[0]

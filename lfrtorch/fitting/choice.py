@@ -1,4 +1,4 @@
-"""Sizes and ridge by cross-validation, and what the choice is worth on data that it has not seen.
+"""The choice of sizes and ridge by cross-validation, and its error on data that it has not seen.
 
 Four stretches of the estimation records are left out in turn (``lfrtorch.fitting.folds``). Linear
 and nonlinear models are fitted to the rest, simulated through what was left out, and begun in it
@@ -14,9 +14,9 @@ from an estimated state, as on new data. Both errors count alike:
    a mean cannot be, it is of the fewest parameters that do about as well as the best
    (``lfrtorch.data.paired_blocks``).
 
-The error of a choice, the least of many, is too small to judge it. So the choice is
-made again without each of the stretches, and judged there (nested cross-validation): the errors of
-``Choice.left_out``, of both models, had no part in the choice.
+The error of a choice is the least of many, and so too small to judge it by. So the choice is made
+again without each of the stretches, and judged on that stretch (nested cross-validation). The
+outputs in ``Choice.left_out``, of both models, are of samples that had no part in their choice.
 
 References:
     Stone, "Cross-validatory choice and assessment of statistical predictions", Journal of the Royal
@@ -71,9 +71,9 @@ from lfrtorch.model.model import Model
 Sizes = dict[str, int]
 
 FOLDS = 4
-"""Stretches that are left out in turn: each fit has three quarters of the data."""
+"""Number of stretches that are left out in turn: each fit has three quarters of the data."""
 
-_BLOCKS = 4  # of each stretch: 16 differences of squared errors tell two models apart
+_BLOCKS = 4  # blocks of each stretch: two models are compared by 16 differences of squared errors
 
 _RIDGES = ((10.0, 12), (1.0, 12), (0.1, 10), (1e-2, 10), (1e-3, 10), (1e-4, 10), (1e-6, 10))
 """Ridges and the iterations of each."""
@@ -83,11 +83,11 @@ _STARTS = 3
 _SMALL = ({"nz": 1, "nw": 1, "nn": 4, "degree": 3}, {"nz": 2, "nw": 2, "nn": 8, "degree": 3})
 """Sizes that are always tried."""
 
-_FLOOR = 1e-6  # error over the outputs' deviation below which models are alike
+_FLOOR = 1e-6  # error, over the outputs' standard deviation, below which models count as equal
 
-_DENSEST = 0.5  # net parameters for each scored output, at most
+_DENSEST = 0.5  # largest number of net parameters for each scored output
 
-_WORSE = 1.3  # error over the best of the larger ridges; twice in a row, smaller ones are not tried
+_WORSE = 1.3  # error over the best so far; two worse ridges in a row end the search
 
 _ERRORS = 2.0
 """Standard errors within which a start or a size is as good as the best: the least of many errors
@@ -96,7 +96,7 @@ is small by chance, too."""
 _MOST = 1.3
 """Largest ratio of rms errors within which it is as good as the best."""
 
-_GAIN = 0.98  # error over the linear model's, or the last best one's, that larger sizes need
+_GAIN = 0.98  # larger sizes are tried as long as the least error falls by more than to this part
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,11 +107,12 @@ class Candidate:
         sizes: nx, nz, nw, and nn or degree.
         seed: seed of the start.
         ridge: weight of the squared distance to the start, or weights by group.
-        parameters_net: without the gauge directions.
+        parameters_net: number of parameters, without the gauge directions.
         ratio: rms error in what was left out over that of the linear model.
         squares: sums of the squared relative errors in the blocks of each stretch, (folds, B).
         outputs: simulations of each stretch (samples, ny), physical units.
-        remembers: no fit without some stretch forgets where it began; it is refused then.
+        remembers: True if the fits without some stretch do not forget their start state; the
+            candidate is then refused.
     """
 
     sizes: Sizes
@@ -167,7 +168,7 @@ class Choice:
         return self.members[0]
 
     def entries(self) -> list[dict[str, Any]]:
-        """Numbers of each, by name."""
+        """Numbers of each candidate, by name."""
         squares = np.array([c.squares.ravel() for c in self.candidates])
         above = Judge(squares, self.counts.ravel()).above()
         return [
@@ -249,7 +250,7 @@ def choose_sizes(
         start: makes a model, for example ``lambda bla, train, sizes, seed: initialise(bla, train,
             seed=seed, **sizes)``, with sizes nz, nw and ``last``.
         given: sizes that are known.
-        ridge: the one of all fits. Default: it is chosen, too.
+        ridge: ridge of all fits. Default: it is chosen, too.
         last: name of the last size, nn or degree; nw if the map has no other.
         seed: seed of the first start; the others have seed + 1000, seed + 2000.
         average: most starts that the model is the mean of.
@@ -421,7 +422,7 @@ class _Step(NamedTuple):
 
     through: Array  # the output where it was left out, simulated through; infinite if it is refused
     fresh: Array  # and begun there
-    remembers: bool  # whether it is refused as it does not forget where it began
+    remembers: bool  # True if the model is refused as it does not forget where it began
 
 
 class _Study:

@@ -1,8 +1,8 @@
-"""States that w alone drives, beside those of the linear model.
+"""States that w alone drives, added to the states of the linear model.
 
-A linear model has the states that the input reaches. States of a nonlinearity begin at rest here:
-modes above the band of the inputs, which friction and impacts excite, and relaxations, from which
-hysteresis is made.
+A linear model has only states that the input drives. This module adds states that the nonlinearity
+drives: modes above the band of the inputs, which friction and impacts excite, and relaxations,
+which describe hysteresis. They are at rest at the start of a fit.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ _DAMPING = 0.03  # damping ratio of the modes
 def distortion_frequencies(
     inputs: Sequence[Float[Array, "T nu"]], errors: Sequence[Float[Array, "T ny"]], count: int
 ) -> Float[Array, " count"]:
-    """Frequencies, rad per sample, that split the power of the nonlinear distortions alike."""
-    # Above the band of the inputs a linear model has no output, and all of its error, normalised,
-    # is distortion.
+    """Frequencies, rad per sample, that split the nonlinear distortions into equal powers."""
+    # Above the band of the inputs a linear model has no output, so all of its error there is
+    # distortion. The errors are normalised.
     edge = _edge(inputs)
-    grid = np.linspace(edge, np.pi, 4096)  # on which spectra of all records are added
-    power = np.zeros_like(grid)  # of all frequencies from the edge up to each
+    grid = np.linspace(edge, np.pi, 4096)  # frequencies at which the spectra of records are added
+    power = np.zeros_like(grid)  # cumulative from the edge
     for error in errors:
         spectrum = np.fft.rfft(np.hanning(len(error) + 1)[:-1, None] * error, axis=0)
         below = np.cumsum((np.abs(spectrum) ** 2).sum(axis=1)) / len(error)
@@ -43,8 +43,8 @@ def distortion_frequencies(
     power -= power[0]
     if edge >= 0.95 * np.pi or not power[-1] > 0:
         raise InputError(
-            f"modes is {count}, and the linear model leaves no errors above the band that the "
-            "inputs excite; give modes=0."
+            f"modes is {count}, but the errors of the linear model have no power above the band "
+            "of the inputs; give modes=0."
         )
     return np.interp((np.arange(count) + 0.5) / count, power / power[-1], grid)
 
@@ -52,14 +52,14 @@ def distortion_frequencies(
 def relaxation_frequencies(
     inputs: Sequence[Float[Array, "T nu"]], count: int
 ) -> Float[Array, " count"]:
-    """Corner frequencies, rad per sample: two decades below half the band in equal ratios."""
+    """Corner frequencies, rad per sample, in equal ratios over two decades up to half the band."""
     return 0.5 * _edge(inputs) * 100.0 ** -((np.arange(count) + 0.5) / count)
 
 
 def frequencies(
     model: Model, records: Sequence[Record], relaxations: int, modes: int
 ) -> tuple[Float[Array, " r"], Float[Array, " m"]]:
-    """Corner frequencies of relaxations, and natural ones of modes, rad per sample."""
+    """Corner frequencies of relaxations and natural frequencies of modes, rad per sample."""
     inputs = [record.u for record in records]
     corners = relaxation_frequencies(inputs, relaxations)
     if not modes:
@@ -78,12 +78,12 @@ def begin_driven(
     z: slice = slice(None),
     w: slice = slice(None),
 ) -> None:
-    """Begin the last states of a cell as driven ones of these frequencies, in place.
+    """Make the last states of a cell relaxations and modes of these frequencies, in place.
 
-    Their entries of Bw and Cy are random; those of Bu are 0, so that they are at rest as long as w
-    is 0. z sees the relaxations, a state each, and not the modes, two states each. Frequencies are
-    in rad per sample; ``z`` and ``w`` say which of them see and drive these states. Entries that
-    are held stay.
+    The entries of these states in Bw and Cy are random. Their entries in Bu are 0, so these states
+    are at rest as long as w is 0. A relaxation has one state, which z sees; a mode has two states,
+    which z does not see. Frequencies are in rad per sample. The slice ``z`` selects the z that see
+    relaxations, and ``w`` the w that drive these states. Held entries do not change.
     """
     before = {name: cell.get_parameter(name).clone() for name in cell.held}
     decay = np.exp(-np.concatenate([relaxations, np.repeat(_DAMPING * modes, 2)]))
@@ -94,7 +94,7 @@ def begin_driven(
     cell.A[first:, first:] = torch.as_tensor(A)
     cell.Bu[first:] = 0.0
     cell.Cz[z, first:] = 0.0
-    # White w of unit variance makes for states of about that.
+    # With this gain, white w of unit variance gives states of about unit variance.
     gain = torch.as_tensor(np.sqrt(1.0 - decay**2)).to(cell.A)
     seen = slice(first, first + len(relaxations))
     for entries in (cell.Bw[first:, w], cell.Cy[:, first:], cell.Cz[z, seen]):
@@ -112,7 +112,7 @@ def with_driven_states(
     modes: int,
     generator: torch.Generator,
 ) -> Model:
-    """A model with the same output, and states beside its own that w alone drives."""
+    """A model with the same output, and with additional states that w alone drives."""
     if not relaxations + modes:
         return model
     found = frequencies(model, records, relaxations, modes)
@@ -126,7 +126,7 @@ def with_driven_states(
 
 @torch.no_grad()
 def _larger(cell: LFRCell, states: int) -> LFRCell:
-    """The cell with more states, whose entries are 0."""
+    """The cell with additional states, whose matrix entries are 0."""
     like = {"dtype": cell.A.dtype, "device": cell.A.device}
     larger = LFRCell(
         cell.nu, cell.ny, cell.nx + states, cell.nz, cell.nw, deepcopy(cell.static),

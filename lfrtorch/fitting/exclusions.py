@@ -1,4 +1,4 @@
-"""Settings that exclude each other: one row a pair, with the reason."""
+"""Settings that exclude each other: a row for each pair, with the reason."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ USUAL = {one.name: one.default for one in fields(PlainSettings)} | {
     "static": "network", "guarantee": None, "integrators": 0, "known": None, "init_from": None,
     "fixed": {},
 }  # fmt: skip
-"""Defaults, which exclude nothing."""
+"""Values that exclude nothing: the defaults."""
 
 
 class Exclusion(NamedTuple):
-    """Two settings of which one at least keeps its default.
+    """Two settings of which at least one must keep its default.
 
     Args:
-        first, second: their names.
+        first, second: names of the settings.
         reason: why a fit cannot have both.
-        values: excluded values of the first, or their types, if others go with the second.
+        values: the values of the first setting, or their types, that exclude the second. Default:
+            all but the default value.
     """
 
     first: str
@@ -31,7 +32,7 @@ class Exclusion(NamedTuple):
     values: tuple[Any, ...] = ()
 
     def holds(self, given: dict[str, Any]) -> bool:
-        """Return whether both settings are given, with values that exclude each other."""
+        """Tell if both settings are given, with values that exclude each other."""
         if not {self.first, self.second} <= {*given}:
             return False
         first, second = given[self.first], given[self.second]
@@ -59,13 +60,13 @@ EXCLUSIONS = (
 
 
 def allowed(name: str, value: Any, given: Mapping[str, Any]) -> bool:
-    """Return whether no row refuses a value of one setting beside the others."""
+    """Tell if a setting may have a value beside the other settings, which are given."""
     rows = [row for row in EXCLUSIONS if name in (row.first, row.second)]
     return not any(row.holds({**given, name: value}) for row in rows)
 
 
 def refuse_together(**given: Any) -> None:
-    """Refuse settings that exclude each other with a ValueError; others need not be given."""
+    """Raise a ValueError if given settings exclude each other; not all settings must be given."""
     for row in EXCLUSIONS:
         if row.holds(given):
             pair = (row.first, row.second)
@@ -75,5 +76,5 @@ def refuse_together(**given: Any) -> None:
 
 
 def _shown(value: Any) -> str:
-    """Return how a message shows a value: a static map may be an object."""
+    """Return a value as a message shows it; a static map may be an object."""
     return "a module" if callable(value) else repr(value)

@@ -1,4 +1,4 @@
-"""A first fit to a part of the records, which chooses one of the starts for a part of the cost."""
+"""A first fit to a part of the records, which chooses a start at a fraction of the cost."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ class FirstPart(Stage):
     name = "the first iterations, on a part of the records"
 
     def when(self, job: Job) -> bool:
-        """Tell if there is a part to be fitted."""
+        """Tell if only a part of the training samples is fitted first."""
         if job.settings.first_part == 1.0:
             return False
         part, train = self.data(job).train, job.dataset.train
         if max(len(job.models), len(part)) < current().world or _samples(part) == _samples(train):
             job.observer.say(
-                f"note: first_part is {job.settings.first_part}, and there are {len(train)} "
-                "training record(s): all are fitted from the first iteration"
+                f"note: first_part is {job.settings.first_part}, and {len(train)} training "
+                "record(s) give no such part: all are fitted from the first iteration"
             )
             return False
         return True
 
     def data(self, job: Job) -> Data:
-        """The part."""
+        """That part of the training records, and the validation and selection records."""
         train = part_of(job.dataset.train, job.settings.first_part)
         return Data.of(job.dataset)._replace(train=train)
 
     def trainer(self, job: Job) -> Trainer:
-        """The job's, for these iterations."""
+        """The trainer of the job, limited to the first iterations."""
         base: Any = job.settings.trainer
         return replace(base, max_iter=job.settings.first_iterations)
 
     def keep(self, job: Job, result: FitResult) -> Job:
-        """The best start; all of them if the model is to be a mean."""
+        """The best start, or all starts if the model is to be a mean."""
         settings, models = best_start(job, result)
         kept = f"seed {settings.seed}"
         if job.settings.average > 1:
@@ -64,15 +64,16 @@ def _samples(records: Sequence[Record]) -> int:
 
 
 def cost_in_full(settings: Settings) -> int:
-    """Number of iterations on all records at the cost of the first ones."""
+    """Number of iterations on all records that cost as much as the first iterations."""
     part = settings.first_part
     return round(part * settings.first_iterations) if part < 1.0 else 0
 
 
 def part_of(records: Sequence[Record], part: float) -> list[Record]:
-    """Records with a part of all samples: the shortest, or the beginning of each."""
-    # Of records of one length some are taken, spread evenly. If even the shortest record has more
-    # samples than the part, that is the beginning of each record, unless it is in steady state.
+    """A part of the samples of all records: the shortest records, or the beginning of each."""
+    # Among records of equal length, the records that are taken are spread evenly. If even the
+    # shortest record is longer than the part, the beginning of each record is taken, unless a
+    # record is in steady state.
     room, found = part * sum(record.samples for record in records), []
     if room < min(r.samples for r in records) and all(r.start != "periodic" for r in records):
         return [_beginning(record, part) for record in records]
@@ -87,6 +88,6 @@ def part_of(records: Sequence[Record], part: float) -> list[Record]:
 
 
 def _beginning(record: Record, part: float) -> Record:
-    """Skipped samples, and a part of the others."""
+    """The skipped samples of a record, and a part of its other samples."""
     end = record.skip + math.ceil(part * (record.samples - record.skip))
     return record.part(slice(end), start=record.start, skip=record.skip, period=None)

@@ -1,4 +1,4 @@
-"""The state of a fit as a value: what its next iteration depends on, and what it has found."""
+"""The state of a fit as a plain value: what its next iteration needs, and its history."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ class Progress:
     """One line of the history.
 
     Args:
-        iteration: 0 is the start.
-        limit: most iterations.
-        train, validation: root mean squared simulation errors, output unit (normalised if outputs
-            have several); validation is NaN if there is no validation record or the model diverges
-            on it.
-        seconds: since the start of the fit.
-        best: True if this iterate is the best so far, on validation if there is one.
+        iteration: number of the iteration; 0 is the start.
+        limit: largest number of iterations.
+        train, validation: root mean squared simulation errors in the output unit (normalised if
+            outputs have several units). ``validation`` is NaN if there is no validation record or
+            the model diverges on one.
+        seconds: time since the start of the fit.
+        best: True if this iterate has the smallest ``score`` so far.
         report: scalars of the trainer.
-        score: normalised squared error that chooses: on validation, or on training without it.
+        score: normalised squared error that chooses the iterate: on the validation records, or on
+            the training records if there are no validation records.
     """
 
     iteration: int
@@ -36,7 +37,7 @@ class Progress:
 
     @property
     def seconds_left(self) -> float:
-        """Time that the remaining iterations would take."""
+        """Time that the remaining iterations would take at the mean rate so far."""
         return self.seconds / max(1, self.iteration) * (self.limit - self.iteration)
 
 
@@ -48,8 +49,8 @@ class FitState:
         search: the trainer's state that the next step goes on from.
         judged: trajectories of the latest iterate on validation records.
         best: θ of the best iterate.
-        chosen: its place in the history.
-        history: values of all iterates, the start first.
+        chosen: index of the best iterate in ``history``.
+        history: one entry for each iterate, the start first.
         score: normalised squared error of the iterate that the search goes on from.
         durations: seconds of each accepted iteration.
     """

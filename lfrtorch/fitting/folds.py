@@ -1,8 +1,8 @@
 """Stretches of time that are left out of a fit in turn: blocked cross-validation inside records.
 
-A stretch is left out by a mask, and the model is simulated through it. So what is left out begins
-in the state that the inputs before it lead to, and a slow system is not judged by the start states
-of short pieces. Records with a measured start are cut instead, as each piece begins at an output.
+A stretch is left out by a mask, and the model is simulated through it. So the stretch begins in the
+state that the inputs before it lead to, and a slow system is not judged by the start states of
+short pieces. Records with a measured start are cut instead, as each piece begins at an output.
 
 References:
     Burman, Chow and Nolan, "A cross-validatory method for dependent data", Biometrika 81(2), 1994.
@@ -27,11 +27,12 @@ class Fold(NamedTuple):
     """Training records, and the samples that were left out of them.
 
     Args:
-        train: the records, their measurements masked where they are left out.
-        windows: first sample and the one after the last, of each record; equal if none is left out.
-        begun: left out samples of each as a record that begins in an estimated state; None
-            if that is too little to tell a state and score the rest. Of a measured start it begins
-            a horizon before, at the output that the first prediction needs.
+        train: the records, with masked measurements in the stretch that is left out.
+        windows: for each record, first left-out sample and the sample after the last one; both are
+            equal if none is left out.
+        begun: for each record, the left-out samples as a record that begins in an estimated state;
+            None if they are too few to determine a state and score the rest. With a measured
+            start it begins a horizon earlier, at the output that the first prediction needs.
     """
 
     train: list[Record]
@@ -112,7 +113,7 @@ def _begun(record: Record, first: int, last: int, horizon: int) -> Record | None
 
 
 def _outside(record: Record, first: int, last: int, horizon: int) -> list[Record]:
-    """Return the record without some of its measurements; none if none is left."""
+    """Return the record without the measurements of a stretch; an empty list if none is left."""
     if record.start == "measured" and last > first:
         pieces = slice(first), slice(last, record.samples)
         return [record[p] for p in pieces if len(record.u[p]) > max(horizon, SHORTEST)]
@@ -120,6 +121,6 @@ def _outside(record: Record, first: int, last: int, horizon: int) -> list[Record
     valid[first:last] = False
     if not valid[record.skip :].any(axis=0).all():
         return []
-    # An estimated start is fitted to all samples that are there.
+    # An estimated start is fitted to all samples that are left.
     skip = 0 if record.start == "estimated" else record.skip
     return [replace(record, valid=valid, skip=skip)]

@@ -1,16 +1,16 @@
-"""Memory of the start: outputs of a model from several start states meet, or stay apart.
+"""Memory of the start: whether outputs of a model from several start states converge or not.
 
-A model may have rests, or ways to move, that no data have shown. It then follows the data from the
-start state that was fitted, in stretches without measurements too, and from another one it stays
+A model may have rest states, or motions, that no data have shown. From the fitted start state it
+then follows the data, also in stretches without measurements; from another start state it stays
 elsewhere for ever. So the training inputs are simulated from the record's own start, from rest, and
-from random states of the second moment that the states have there; what counts is the largest rms
+from random states with the second moment of the record's states. The measure is the largest rms
 distance of the outputs from those of the own start, in the last third of a record, over the
-outputs' deviation.
+outputs' standard deviation.
 
-A lightly damped system forgets slowly, and one that integrates never does. So a model may be as
-forgetful as the linear model of the same data. A system may have several rests, as a toggle or a
-pendulum that swings over has: where the trajectories that stay apart end among states that the
-records have visited, the model is right to remember.
+A lightly damped system forgets slowly, and a system that integrates never forgets. So a model may
+forget as slowly as the linear model of the same data. A system may have several rest states, such
+as a toggle, or a pendulum that swings over. If trajectories that stay apart end among states that
+the records have visited, the model is right to remember.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.model import Model
 
 LIMIT = 0.02
-"""Distance, over the outputs' deviation, up to which outputs have met."""
+"""Distance, over the outputs' standard deviation, up to which outputs count as converged."""
 
-_RANDOM = 12  # start states, beside the record's own and rest
+_RANDOM = 12  # random start states, beside the record's own and rest
 
-_LONGEST = 10_000  # samples of a record that are simulated
+_LONGEST = 10_000  # largest number of samples of a record that are simulated
 
-_SAMPLES = 60_000  # of all records together: the longest come first
+_SAMPLES = 60_000  # largest number of samples of all records together, the longest records first
 
-_SLOWER = 2.0  # distance over the linear model's that is no fault
+_SLOWER = 2.0  # largest distance over the linear model's that counts as forgetting
 
-_NEAR = 2.0  # distance to visited states over that of these to those of other parts, the medians
+_NEAR = 2.0  # median distance to visited states, over that between parts of the visited states
 _PARTS = 8  # of the records' states in time
 _LOOKED_AT = 200  # states at the end of a trajectory that is apart
 
@@ -50,11 +50,11 @@ class Memory(NamedTuple):
     """Distance of outputs from several start states in the last third of the training records.
 
     Args:
-        apart: largest rms distance of outputs from several starts, over the outputs' deviation;
-            infinite if the model diverges from one of them.
-        linear: the same of the linear model; 0 if there is none.
+        apart: largest rms distance of outputs from several starts, over the outputs' standard
+            deviation; infinite if the model diverges from a start.
+        linear: the same distance for the linear model; 0 if there is none.
         visited: True if trajectories that stay apart end at states that the records have visited:
-            the system has several rests.
+            the system then has several rest states.
 
     Example:
         >>> print(lfrtorch.Memory(apart=0.001))
@@ -69,12 +69,12 @@ class Memory(NamedTuple):
 
     @property
     def fades(self) -> bool:
-        """Tell whether the outputs meet, as far as the linear model's do."""
+        """Tell whether the outputs converge, or stay apart little more than the linear model's."""
         return self.apart <= max(LIMIT, _SLOWER * self.linear)
 
     @property
     def right(self) -> bool:
-        """Tell whether the model forgets, or remembers what the records have shown."""
+        """Tell whether the model forgets its start, or only remembers rests that records visit."""
         return self.fades or self.visited
 
     def __str__(self) -> str:
@@ -100,9 +100,9 @@ def forgets(
 
     Args:
         model: model to simulate.
-        records: those that it was fitted to.
-        linear: the linear model of the same records, or the start of the fit: a model may be as
-            slow. Default: none.
+        records: records that the model was fitted to.
+        linear: the linear model of the same records, or the start of the fit: the model may forget
+            as slowly. Default: none.
 
     Example:
         >>> memory = lfrtorch.forgets(model, record, bla)
@@ -130,7 +130,7 @@ def forgets(
 def _apart(
     model: Model, records: Sequence[Record], scale: np.ndarray
 ) -> tuple[float, list[Tensor], list[Tensor]]:
-    """Return the largest distance, the ends of all that stays apart, and the records' own paths."""
+    """Return the largest distance, the ends of trajectories that stay apart, and the own paths."""
     most, ends, paths = 0.0, list[Tensor](), list[Tensor]()
     generator = torch.Generator().manual_seed(0)
     cell = model.lfr.cell
@@ -144,7 +144,7 @@ def _apart(
         moment = (own.mT @ own / len(own)).double()
         values, axes = torch.linalg.eigh(moment)
         root = axes * values.clamp_min(0.0).sqrt()
-        # Half of them as the states are correlated, and half as if they were not.
+        # Half of the states are drawn with the states' correlations, half without them.
         draws = torch.randn(2, _RANDOM // 2, cell.nx, generator=generator, dtype=torch.float64)
         draws = torch.cat([draws[0] @ root.mT, draws[1] * moment.diagonal().sqrt()])
         starts = torch.cat([own[:1], torch.zeros_like(own[:1]), draws.to(own)]).to(cell.A)
@@ -162,7 +162,7 @@ def _apart(
 
 
 def _visited(ends: Sequence[Tensor], paths: Sequence[Tensor]) -> bool:
-    """Tell whether ends of trajectories are as near the records' states as these are to others."""
+    """Tell whether trajectories end as near the records' states as these are to each other."""
     states = np.concatenate([path.numpy() for path in paths])
     deviation = states.std(axis=0)
     deviation = np.where(deviation > 0.0, deviation, 1.0)

@@ -1,9 +1,9 @@
 """Fits that begin at measured outputs: from short windows to long ones.
 
-No simulation of an unstable system over a long horizon is near the data while the parameters are
-poor: errors grow with the horizon until they say nothing. The error over a few samples is nearly
-linear in the parameters, so a fit begins there, and goes on with longer windows from where the
-shorter ones led.
+While the parameters are poor, a simulation of an unstable system over a long horizon is never near
+the data: errors grow with the horizon until they carry no information. The error over a few samples
+is nearly linear in the parameters. So a fit begins with short windows, and continues with longer
+windows from the model that the shorter windows gave.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ PARTS = (0.1, 0.3)
 """Window lengths of the first two fits, relative to the horizon."""
 
 _ITERATIONS = 10
-"""Most iterations with each of these windows."""
+"""Largest number of iterations of each of these fits."""
 
 
 def with_measured_states(model: Model) -> Model:
-    """The model with its normalised outputs as states; a fit leaves them so."""
+    """The model in coordinates where its states are the normalised outputs; a fit keeps these."""
     cell = deepcopy(model.lfr.cell)
     own = {name: p.detach().double().cpu().numpy() for name, p in cell.named_parameters()}
     if own["Cy"].shape[0] != cell.nx or np.linalg.matrix_rank(own["Cy"]) < cell.nx:
         raise InputError(
-            f"the records have start 'measured' and the model {cell.nx} states for {cell.ny} "
-            f"outputs; give nx={cell.ny}, or start='estimated'."
+            f"the records have start='measured', and the model has {cell.nx} states that its "
+            f"{cell.ny} outputs do not determine; give nx={cell.ny}, or start='estimated'."
         )
     found = transformed(own, own["Cy"])
     with torch.no_grad():
@@ -59,7 +59,7 @@ class MeasuredStates(Stage):
         return made and begins_at_outputs(job.dataset.train)
 
     def run(self, job: Job) -> Job:
-        """The models in these coordinates."""
+        """The models in coordinates where the states are the outputs."""
         return replace(job, models=[with_measured_states(model) for model in job.models])
 
 
@@ -85,22 +85,22 @@ class ShortWindows(Stage):
         return begins_at_outputs(job.dataset.train) and _samples(self._part, horizon) not in before
 
     def data(self, job: Job) -> Data:
-        """As many windows as there will be whole ones: these iterations cost so much less."""
+        """As many short windows as there are full ones, so that these iterations cost less."""
         horizon = cast(int, job.settings.horizon)
         samples, scale = _samples(self._part, horizon), job.models[0].scaler.y_scale
         cut = [windows_from_outputs(r, samples, horizon, scale) for r in job.dataset.train]
         return Data([part for parts in cut for part in parts])
 
     def trainer(self, job: Job) -> Trainer:
-        """A few iterations."""
+        """A trainer with few iterations."""
         return LevenbergMarquardt(max_iter=_ITERATIONS)
 
     def options(self, job: Job) -> Mapping[str, Any]:
-        """The windows are cut."""
+        """No horizon, as the records are cut into windows already."""
         return {"horizon": None}
 
     def keep(self, job: Job, result: FitResult) -> Job:
-        """The best start."""
+        """The job that goes on from the best start."""
         settings, models = best_start(job, result) if result.starts else (job.settings, job.models)
         job.observer.say(
             f"windows of {_samples(self._part, cast(int, settings.horizon))} samples: "

@@ -1,8 +1,8 @@
-"""Entries of the matrices that are given: a start is put into coordinates that have them.
+"""Given entries of the matrices: a start is transformed to state coordinates that have them.
 
-Matrices of a linear model are known up to the coordinates of its states. So an entry that is given
-is first an equation for the coordinates: of all, those are taken whose matrices are nearest to what
-is given. The given values are then written, and a fit holds them.
+Matrices of a linear model are determined up to the coordinates of its states. So a given entry is
+first an equation for the coordinates: the coordinates are chosen whose matrices are nearest to the
+given entries. Then the given values are written into the matrices, and a fit holds them.
 """
 
 from __future__ import annotations
@@ -27,28 +27,29 @@ from lfrtorch.fitting.stage import Job, Stage
 from lfrtorch.model.model import Model
 
 Given = Mapping[str, Any]
-"""Matrices of an NL-LFR by name, in physical units; NaN stands for what is free."""
+"""Matrices of an NL-LFR by name, in physical units; NaN marks entries that are free."""
 
 _TRIES = 8
-"""Coordinates that the search begins in."""
+"""Number of coordinate changes that the search begins at."""
 
 _ILL = 1e6
-"""Condition number of coordinates that are too far from those of the start."""
+"""Largest condition number of a change of coordinates."""
 
 
 def with_given(model: Model, given: Given) -> tuple[Model, float]:
-    """A model of the same linear part with the entries, and by how much these differed from it.
+    """A model with the given entries, and the largest change that setting them made.
 
     Args:
-        model: a start; its static map stays as it is.
-        given: matrices with u and y in physical units, x, z and w as the model has them.
+        model: a start; its static map does not change.
+        given: matrices with u and y in physical units, and x, z and w in the model's units.
 
     Returns:
-        The model, and the largest difference before an entry was set, relative to the largest entry
-        of its matrix; 0 up to rounding if there are coordinates that have all entries.
+        The model in other state coordinates, and the largest change of an entry when it was set,
+        relative to the largest entry of its matrix. The change is 0 up to rounding if there are
+        coordinates that have all given entries.
 
     Raises:
-        ValueError: no such matrix, another shape, or no finite number at all.
+        ValueError: an unknown matrix, a wrong shape, or a matrix without a finite number.
     """
     if not given:
         return model, 0.0
@@ -89,30 +90,30 @@ def with_given(model: Model, given: Given) -> tuple[Model, float]:
 
 
 class GivenEntries(Stage):
-    """Starts with the entries of ``fixed``."""
+    """Starts with the entries that ``fixed`` gives."""
 
     def check(self, job: Job) -> None:
-        """Refuse matrices of other shapes."""
+        """Refuse matrices of wrong shapes."""
         settings, first = job.settings, job.given.train[0]
         sizes = settings.states, len(first.inputs), len(first.outputs), settings.nz, settings.nw
         checked(settings.fixed, shapes(*sizes))
 
     def when(self, job: Job) -> bool:
-        """Tell if there are such entries."""
+        """Tell if entries are given."""
         return bool(job.settings.fixed)
 
     def run(self, job: Job) -> Job:
         """The models with these entries."""
         found = [with_given(model, job.settings.fixed) for model in job.models]
         job.observer.say(
-            "fixed: the start differed from what is given by "
-            f"{percent(max(apart for _, apart in found))} of a matrix's largest entry at most"
+            "fixed: entries of the start differed from the given ones by at most "
+            f"{percent(max(apart for _, apart in found))} of the largest entry of their matrix"
         )
         return replace(job, models=[model for model, _ in found])
 
 
 def shapes(nx: Any, nu: int, ny: int, nz: Any, nw: Any) -> dict[str, tuple[Any, Any]]:
-    """Shapes of the matrices; a size that no given matrix has may be ``"auto"``."""
+    """Shapes of the matrices; a size may be ``"auto"`` if no given matrix depends on it."""
     into, of = {"A": nx, "Bu": nu, "Bw": nw}, {"Cz": nz, "Cy": ny}
     found = {name: (nx, size) for name, size in into.items()}
     found |= {name: (size, nx) for name, size in of.items()}
@@ -120,7 +121,7 @@ def shapes(nx: Any, nu: int, ny: int, nz: Any, nw: Any) -> dict[str, tuple[Any, 
 
 
 def checked(given: Given, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Array]:
-    """The matrices as arrays; refuse those that a model of these shapes has not."""
+    """The matrices as arrays; refuse matrices that do not fit a model of these shapes."""
     found = {}
     for name, value in given.items():
         if name not in Matrices._fields:
@@ -130,8 +131,8 @@ def checked(given: Given, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Ar
         matrix = reals(f"fixed {name}", value)
         if matrix.shape != shapes[name]:
             raise InputError(
-                f"fixed {name} has the shape {matrix.shape}; the model's has {shapes[name]}, with "
-                "NaN for entries that are free."
+                f"fixed {name} has the shape {matrix.shape}; give {shapes[name]}, the model's, "
+                "with NaN for entries that are free."
             )
         if np.isinf(matrix).any() or not np.isfinite(matrix).any():
             raise InputError(
@@ -142,7 +143,7 @@ def checked(given: Given, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Ar
 
 
 def transformed(own: Mapping[str, Array], T: Float[Array, "nx nx"]) -> dict[str, Array]:
-    """The matrices with T x for x."""
+    """The matrices of the model whose state is T x."""
     inverse = np.linalg.inv(T)
     left = {name: T @ own[name] for name in ("A", "Bu", "Bw")}
     right = {name: own[name] @ inverse for name in ("Cz", "Cy")}
@@ -150,7 +151,7 @@ def transformed(own: Mapping[str, Array], T: Float[Array, "nx nx"]) -> dict[str,
 
 
 def coordinates(own: Mapping[str, Array], wanted: Mapping[str, Array]) -> Float[Array, "nx nx"]:
-    """The T with which the matrices come nearest to what is wanted, by least squares."""
+    """The T whose transformed matrices are nearest to the wanted entries, by least squares."""
     nx, random = len(own["A"]), np.random.default_rng(0)
     moved = [name for name in wanted if name in ("A", "Bu", "Bw", "Cz", "Cy")]
     if not moved:

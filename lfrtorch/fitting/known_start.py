@@ -1,9 +1,9 @@
-"""Where a fit of a known model starts: its parameters first, and then what is learned beside it.
+"""Starts of a fit of a known model: first its parameters are fitted, then learned parts are added.
 
-The LFR has the known model as a block of its static map, with matrices that are given: they take
-x and u to it, and its next state and output from it. Beside it stand a network (or polynomial) and
-``nx`` states, which see all states and inputs, and act on all states and outputs. The learned part
-begins at zero, so the model begins as the known one.
+The known model is a block of the LFR's static map. Fixed matrices lead x and u to this block, and
+its next state and output back. A network (or polynomial) and ``nx`` states are learned beside it:
+they see all states and inputs, and act on all states and outputs. The learned part begins at zero,
+so the model begins as the known model.
 """
 
 from __future__ import annotations
@@ -40,23 +40,24 @@ from lfrtorch.model.known import Known
 from lfrtorch.model.model import Model
 
 _ITERATIONS = 240
-"""Iterations of the first fit, of the few parameters alone."""
+"""Iterations of the first fit, which fits only the parameters of the known model."""
 
 _FROM_OUTPUTS = 20
-"""The same after those over short windows, which begin at outputs."""
+"""Iterations of that fit if records begin at outputs, where fits over short windows precede it."""
 
 _STARTS = 8
-"""Number of values of the parameters from which that fit starts."""
+"""Number of starts of that fit, each with other values of the parameters."""
 
 _SPREAD = 0.5
-"""Standard deviation of the logarithms of all values but the first."""
+"""Standard deviation of the logarithm of the factor on each parameter, for all starts but the
+first."""
 
 _REACH = 0.3
-"""Largest weight of w on a state or an output, of unit rms, at the start."""
+"""Largest entry of Bw and Dyw at the start, for states and outputs of unit rms."""
 
 
 def known_model(known: Known, linear: LinearModel, records: Sequence[Record]) -> Model:
-    """The known model itself as an LFR; signals have the offsets of the linear model."""
+    """The known model as an LFR; its signals have the offsets of the linear model."""
     first = records[0]
     nu, ny, nx = len(first.inputs), len(first.outputs), len(known.states)
     scaler = Scaler(
@@ -92,7 +93,7 @@ def around(
     learned: StaticMap | None = None,
     states: int = 0,
 ) -> LFRCell:
-    """The cell around a known model and, beside it, a learned map and learned states; all at 0."""
+    """The cell around a known model, a learned map and learned states; learned entries are 0."""
     nx, names = len(known.states), [state.name for state in known.states]
     parts = [static] if learned is None else [static, learned]
     sizes = [(part.nz, part.nw) for part in parts]
@@ -106,7 +107,7 @@ def around(
     x, z, w = (torch.arange(n) for n in (nx + states, nz, nw))
     own_x, own_z, own_w = x < nx, z < static.nz, w < static.nw
 
-    def not_among(some: Sequence[str]) -> Tensor:  # known states that are not
+    def not_among(some: Sequence[str]) -> Tensor:  # mask of the known states that are not in some
         return torch.tensor([n not in some for n in names] + [False] * states, dtype=torch.bool)
 
     unseen, alone = not_among(known.sees), not_among(known.acts_on)
@@ -126,7 +127,7 @@ def around(
 
 
 def with_learned(model: Model, records: Sequence[Record], settings: Settings, seed: int) -> Model:
-    """A known model with what is to be learned beside it, which is zero still."""
+    """A known model with the parts to be learned added, whose output is still zero."""
     old, static = model.lfr.cell, deepcopy(model.lfr.cell.map.known)
     known, nx, states = cast(Known, settings.known), old.nx, cast(int, settings.nx)
     generator = torch.Generator().manual_seed(seed)
@@ -173,7 +174,7 @@ def with_learned(model: Model, records: Sequence[Record], settings: Settings, se
 
 
 def learned_map(settings: Settings, generator: torch.Generator) -> StaticMap | None:
-    """The map that is learned beside a known model; None if none is asked for."""
+    """The map that is learned beside a known model; None if the settings ask for none."""
     nz, nw, nn = (cast(int, size) for size in (settings.nz, settings.nw, settings.nn))
     if settings.static != "network":
         return as_map(settings.static_map()["static"].to(torch.float64), nz, nw)
@@ -185,7 +186,7 @@ def learned_map(settings: Settings, generator: torch.Generator) -> StaticMap | N
 
 
 def varied(model: Model, seed: int) -> Model:
-    """The known model with other parameters: within the bounds, and else by a random factor."""
+    """The known model with each parameter times a random factor, clipped to its bounds."""
     found = deepcopy(model)
     static, random = found.lfr.cell.map.known, np.random.default_rng(seed)
     low, high = static.weight_bounds.numpy().T
@@ -198,18 +199,18 @@ def varied(model: Model, seed: int) -> Model:
 
 
 class FromEquations(Stage):
-    """A known model with the parameters that are given, and with others near them."""
+    """A known model with the given parameters, and copies with parameters near the given ones."""
 
     def when(self, job: Job) -> bool:
         """Tell if a known model is given."""
         return job.settings.known is not None
 
     def run(self, job: Job) -> Job:
-        """Make the models; without a ridge, which keeps what is learned afterwards near."""
+        """Make the models; the next fit has no ridge, which is for the learned part alone."""
         settings, train = job.settings, job.dataset.train
         known, count = cast(Known, settings.known), _count(settings)
-        if begins_at_outputs(train):  # which are states: nothing learned acts on them at once
-            known, count = copy(known), 1  # short windows lead to the best minimum
+        if begins_at_outputs(train):  # outputs are states: the learned part has no feedthrough
+            known, count = copy(known), 1  # one start: short windows lead to the best minimum
             known.acts_on = tuple(name for name in known.acts_on if name != "y")
             settings = replace(settings, known=known)
         model = known_model(known, job.linear, in_windows(train, settings.horizon))
@@ -223,16 +224,16 @@ class FromEquations(Stage):
 
 
 class Parameters(Stage):
-    """The fit to the parameters of a known model alone."""
+    """The fit of the parameters of a known model alone."""
 
-    name = "the fit to the parameters of the known model"
+    name = "the fit of the parameters of the known model"
 
     def when(self, job: Job) -> bool:
-        """Tell if it has parameters."""
+        """Tell if a known model is given and has parameters."""
         return job.settings.known is not None and bool(job.settings.known.parameters)
 
     def trainer(self, job: Job) -> Trainer:
-        """Enough iterations for few parameters."""
+        """A trainer with enough iterations for few parameters."""
         begun = begins_at_outputs(job.dataset.train)
         return LevenbergMarquardt(max_iter=_FROM_OUTPUTS if begun else _ITERATIONS)
 
@@ -242,13 +243,13 @@ class Parameters(Stage):
             return super().run(job)
         except StartDivergesError:
             raise StartDivergesError(
-                "the known model diverges on the training records, with the parameters that are "
-                "given and with others near them.\nGive values with which it is stable, start "
-                "states near (State(rest=...)), or more steps in a sample (substeps=10)."
+                "the known model diverges on the training records, both with the given parameters "
+                "and with values near them.\nGive parameters with which it is stable, a better "
+                "rest state (State(rest=...)), or more steps in a sample (substeps=10)."
             ) from None
 
     def keep(self, job: Job, result: FitResult) -> Job:
-        """The best values."""
+        """The job that goes on from the best parameters."""
         model, error = result.model, result.history[result.chosen_iteration].train
         values = ", ".join(f"{name} {number(value)}" for name, value in physical(model).items())
         job.observer.say(
@@ -259,7 +260,7 @@ class Parameters(Stage):
 
 
 def fitted_equations(job: Job, linear: LinearModel, train: Sequence[Record]) -> Job:
-    """The job with a known model whose parameters are fitted to some records."""
+    """The job with a known model whose parameters are fitted to the given records."""
     dataset = replace(job.dataset, train=train, validation=[], selection=[])
     job = replace(job, dataset=dataset, linear=linear, observer=Observer())
     for stage in (FromEquations(), Parameters()):
@@ -268,14 +269,14 @@ def fitted_equations(job: Job, linear: LinearModel, train: Sequence[Record]) -> 
 
 
 class Learned(Stage):
-    """Learned parts beside a known model, one draw for each start."""
+    """Learned parts beside a known model, drawn anew for each start."""
 
     def when(self, job: Job) -> bool:
         """Tell if there is a known model."""
         return job.settings.known is not None
 
     def run(self, job: Job) -> Job:
-        """The models with it, or the known model alone."""
+        """The known model with learned parts, one for each start, or the known model alone."""
         settings, model = job.settings, job.models[0]
         if not settings.learns:
             settings, models = replace(settings, starts=1, ridge=0.0), [model]
@@ -289,18 +290,18 @@ class Learned(Stage):
 
 
 def _asked(settings: Settings) -> int:
-    """Number of starts."""
+    """Number of starts that the settings ask for."""
     return _STARTS if settings.starts == "auto" else settings.starts
 
 
 def _count(settings: Settings) -> int:
-    """Number of values that the parameters start from."""
+    """Number of starts of the fit of the parameters."""
     if not cast(Known, settings.known).parameters:
         return 1
     return _STARTS if settings.learns else _asked(settings)
 
 
 def physical(model: Model) -> dict[str, float]:
-    """The parameters of a known model in their units; none of another model."""
+    """The parameters of a known model by name, in their units; empty for any other model."""
     known = model.lfr.cell.map.known
     return {} if known is None else known.physical

@@ -36,9 +36,9 @@ class Refit(Stage):
         return True
 
     def run(self, job: Job) -> Job:
-        """The fit and that to all records; without it if the model that was chosen stays."""
-        # A fit that was interrupted here has that for its reason. Records have no windows for
-        # scores: what need not be skipped is fitted.
+        """Add the fit to all records; the chosen model stays if that fit makes it unstable."""
+        # If this fit is interrupted, "interrupted" becomes the reason of the fit before. Records
+        # here have no score window: all samples that need not be skipped are fitted.
         settings, dataset, result = job.settings, job.given, job.result
         held_out = [*dataset.validation, *dataset.selection]
         again = _whole_or_cut(
@@ -65,22 +65,22 @@ class Refit(Stage):
         )
         if bool(torch.lt(*agreed(margins))):
             job.observer.say(
-                "note: refit: the model would become unstable on louder inputs; that before it "
-                "stays"
+                "note: refit: the refitted model is unstable on louder inputs; the model before "
+                "it is kept"
             )
             return job
         before, after = (again.history[i].train for i in (0, again.chosen_iteration))
         unit = common_unit(again.model.outputs)
         job.observer.say(
             f"refit to all estimation records: {again.iterations} iterations, "
-            f"{quantity(again.seconds, 's')}, their error {quantity(before, unit)} -> "
-            f"{quantity(after, unit)}; validation errors are those before it"
+            f"{quantity(again.seconds, 's')}, error on these records {quantity(before, unit)} -> "
+            f"{quantity(after, unit)}; validation errors are those before the refit"
         )
         return replace(job, again=again)
 
 
 def _whole_or_cut(before: FitResult, again: Callable[[], FitResult]) -> FitResult:
-    """A fit that follows another one; if it was cut short, the one before with that reason."""
+    """A second fit, or the fit before it, with the reason, if the second was cut short."""
     try:
         result = again()
     except (KeyboardInterrupt, StoppedError):

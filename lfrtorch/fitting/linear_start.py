@@ -32,7 +32,7 @@ class BestLinear(Stage):
         return not begins_at_outputs(job.dataset.train)
 
     def run(self, job: Job) -> Job:
-        """Estimate it."""
+        """Estimate the best linear approximation."""
         settings, train = of_linear_model(job.settings), job.dataset.train
         records = linear_records(train, settings, job.observer)
         linear, scan = linear_model(
@@ -44,21 +44,21 @@ class BestLinear(Stage):
 
 
 class OutputsAsStates(Stage):
-    """The linear model whose states are the outputs, of records that begin at these."""
+    """The linear model whose states are the outputs, for records with a measured start."""
 
     def when(self, job: Job) -> bool:
         """Tell if the states are the outputs."""
         return begins_at_outputs(job.dataset.train)
 
     def run(self, job: Job) -> Job:
-        """Estimate it; refuse what cannot be scored so."""
+        """Estimate the linear model; refuse settings that do not fit such records."""
         linear = measured_states_model(job.dataset.train)
         tell(linear, job.observer)
         return replace(job, settings=_of_outputs(job), linear=linear, begun=linear)
 
 
 def _of_outputs(job: Job) -> Settings:
-    """The settings of a model whose states are the outputs; refuse what cannot be scored so."""
+    """The settings of a model whose states are the outputs; refuse other nx and short records."""
     dataset, settings = job.dataset, job.settings
     ny, horizon = len(dataset.train[0].outputs), settings.horizon or 0
     for record in (*dataset.train, *dataset.validation, *dataset.selection, *dataset.tests):
@@ -71,14 +71,14 @@ def _of_outputs(job: Job) -> Settings:
         return settings
     if settings.nx != "auto":
         raise InputError(
-            f"nx is {settings.nx}, and with start='measured' the {ny} outputs are the states; give "
+            f"nx is {settings.nx}, but with start='measured' the {ny} outputs are the states; give "
             f"nx={ny} or nx='auto'."
         )
     return replace(settings, nx=ny)
 
 
 def of_linear_model(settings: Settings) -> Settings:
-    """The settings with the order of the linear model that a known one is compared with."""
+    """The settings of the linear model that a known model is compared with."""
     if not settings.known_states:
         return settings
     nx = settings.known_states + cast(int, settings.nx)
@@ -106,7 +106,7 @@ def linear_model(
         observer.say(scan.table())
         for note in scan.notes:
             observer.say(f"note: {note}")
-        # Rounding may differ from machine to machine, and the order must not.
+        # Rounding may differ between processes, so the first process decides the order.
         chosen = int(agreed(torch.tensor(scan.chosen)))
         linear = scan.models[scan.orders.index(chosen)]
     else:
@@ -116,14 +116,14 @@ def linear_model(
 
 
 def approximation(records: Sequence[Record], nx: int, settings: Settings) -> LinearModel:
-    """The linear model of an order, or that whose states are the outputs."""
+    """The linear model of an order, or the model whose states are the outputs."""
     if begins_at_outputs(records):
         return measured_states_model(records)
     return estimate_bla(records, nx, **settings.linear)
 
 
 def tell(linear: LinearModel, observer: Observer) -> None:
-    """Say what a linear model is."""
+    """Report a linear model to the observer."""
     found = linear.fit
     assert found is not None
     observer.say(
@@ -138,8 +138,8 @@ def linear_records(
     train: Sequence[Record], settings: Settings, observer: Observer
 ) -> Sequence[Record]:
     """Return the records that the linear model is estimated from: those in steady state, or all."""
-    # A best linear approximation is that of one kind of signal, and takes a fraction of the work in
-    # steady state. If those records excite too little for the order, all are taken.
+    # A best linear approximation holds for one kind of signal, and is much cheaper to estimate from
+    # records in steady state. If these records excite too little for the order, all are taken.
     steady = [record for record in train if record.start == "periodic"]
     if len(steady) in (0, len(train)):
         return train

@@ -1,4 +1,4 @@
-"""One line that follows a fit, rewritten in place."""
+"""A line that shows the progress of a fit and is rewritten in place."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from lfrtorch.data.records import common_unit
 from lfrtorch.fitting.trainer import Progress, Round
 from lfrtorch.model.model import Model
 
-_DIGITS = 4  # significant digits of errors: an iteration often moves the fourth alone
+_DIGITS = 4  # significant digits of errors: an iteration often changes only the fourth digit
 
 
 class LiveLine:
-    """A line that the next text replaces, on a terminal and in a notebook; none elsewhere."""
+    """A line on a terminal or in a notebook that the next text replaces; elsewhere nothing."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = sys.stdout if stream is None else stream  # None without a console
@@ -31,29 +31,29 @@ class LiveLine:
         self._length, self._cell = 0, None
 
     def show(self, text: str) -> None:
-        """Replace the line; parts that are too many for the terminal's width are left out."""
+        """Replace the line; the last parts are left out if the terminal is too narrow."""
         if self._in_cell:
-            # A saved notebook would keep all texts of a stream.
+            # Texts written to a stream would all stay in a saved notebook.
             display = import_module("IPython.display").display
             if self._cell is None:
                 self._cell = display({"text/plain": text}, raw=True, display_id=True)
             else:
                 self._cell.update({"text/plain": text}, raw=True)
         elif self.live:
-            width = shutil.get_terminal_size().columns - 1  # a full line would break
+            width = shutil.get_terminal_size().columns - 1  # a line of full width would wrap
             while len(text) > width and "  " in text.rstrip():
                 text = text.rstrip().rpartition("  ")[0]
             self._write(f"\r{text[:width].ljust(self._length)}")
             self._length = len(text[:width])
 
     def say(self, text: str) -> None:
-        """Replace the line by one that stays."""
+        """Replace the line by a text that stays."""
         start = "\r" if self._length else ""
         self._write(f"{start}{text.ljust(self._length)}\n")
         self._length = 0
 
     def close(self, *, keep: bool = True) -> None:
-        """End the line, if there is one, or take it away for another one."""
+        """End the line, if there is one, or erase it if ``keep`` is False."""
         if self._length:
             self._write("\n" if keep else f"\r{' ' * self._length}\r")
         self._length, self._cell = 0, None
@@ -65,11 +65,11 @@ class LiveLine:
 
 
 class ProgressLine:
-    """A line that follows a fit, or a line now and then if the stream cannot rewrite one.
+    """A line that shows the progress of a fit, or a new line now and then if none can be rewritten.
 
     Args:
-        every: iterations between lines if none can be rewritten; ``None`` for none at all.
-        stream: where to write. Default: standard output.
+        every: iterations between lines on a stream that cannot rewrite them; None: no lines there.
+        stream: stream to write to. Default: standard output.
 
     Example:
         >>> from lfrtorch.fitting.live_line import ProgressLine
@@ -96,7 +96,7 @@ class ProgressLine:
                 self.close()
 
     def close(self) -> None:
-        """End the line; if the stream cannot rewrite one, show the last iteration."""
+        """End the line; if the stream cannot rewrite lines, show the last iteration."""
         self._line.close()
         if self._unseen:
             self._line.say(self._unseen)
@@ -104,7 +104,7 @@ class ProgressLine:
 
 
 def _progress_text(progress: Progress, unit: str, best: Progress | None = None) -> str:
-    """Write iteration, errors beside the best so far, time left and scalars of the trainer."""
+    """Write iteration, errors, the best error so far, time left and scalars of the trainer."""
     limit = str(progress.limit)
     parts = [f"{progress.iteration:>{len(limit)}}/{limit}", *_errors(progress, unit)]
     if progress.best and not math.isnan(progress.validation):
@@ -122,7 +122,7 @@ def _progress_text(progress: Progress, unit: str, best: Progress | None = None) 
 
 
 def _errors(progress: Progress, unit: str) -> list[str]:
-    """Write the errors on training and, if there is one, validation."""
+    """Write the training error and, if there is one, the validation error."""
     train, validation = quantities([progress.train, progress.validation], unit, _DIGITS)
     if math.isnan(progress.validation):
         return [f"train {train}"]
@@ -130,7 +130,7 @@ def _errors(progress: Progress, unit: str) -> list[str]:
 
 
 def _duration(seconds: float) -> str:
-    """Write 45 s, 5 min or 2 h 05 min."""
+    """Write a duration as 45 s, 5 min or 2 h 05 min."""
     minutes = round(seconds / 60)
     if seconds < 120:
         return f"{seconds:.0f} s"
@@ -138,7 +138,7 @@ def _duration(seconds: float) -> str:
 
 
 def errors_of_round(ended: Round) -> dict[str, float]:
-    """The best of the starts' errors, and of several the median and the worst, too."""
+    """The best of the starts' errors; for several starts, also the median and the worst."""
     judged = [(s.selection, s.validation, s.train) for s in ended.starts]
     found = [next(e for e in each if not math.isnan(e)) for each in judged]
     numbers = {"best": found[0], "median": median(found), "worst": max(found)}
@@ -147,13 +147,13 @@ def errors_of_round(ended: Round) -> dict[str, float]:
 
 
 class StartsLine:
-    """A line that follows all iterations of several starts, and a line for each of their rounds.
+    """A line that shows the progress of several starts, and a line for each of their rounds.
 
     Args:
         starts: number of starts.
         unit: unit of the errors.
-        stream: where to write. Default: standard output.
-        iterations: those of all starts together, for the time left.
+        stream: stream to write to. Default: standard output.
+        iterations: number of iterations of all starts together, for the time left.
 
     Example:
         >>> from lfrtorch.fitting.live_line import StartsLine

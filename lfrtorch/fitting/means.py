@@ -1,4 +1,4 @@
-"""The mean of several NL-LFR models, which is one, too: their blocks side by side."""
+"""The mean of several NL-LFR models: an NL-LFR with their blocks side by side."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ from lfrtorch.model.model import Model
 def mean_model(models: Sequence[Model]) -> Model:
     """The model whose output is the mean of the outputs of several models.
 
-    Models that fit alike from different random starts differ in what the data do not tell. There
-    the squared error of their mean is at most the mean of theirs. It has the states, z and w of
-    all, and their static maps beside each other: networks of the same activation are one network.
+    Models that fit alike from different random starts differ where the data do not determine them.
+    The squared error of the mean model is at most the mean of the models' squared errors. The mean
+    model has the states, z and w of all models, and their static maps side by side. Networks of
+    the same activation become one network.
 
     Args:
         models: models of the same data; they are copied.
@@ -102,9 +103,9 @@ def _beside(cells: Sequence[LFRCell]) -> Module | None:
 
 
 def _held_beside(cells: Sequence[LFRCell], whole: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Masks of the mean of cells; where a block has entries that are held, blocks stay apart.
+    """Masks of held entries of the mean; zeros between blocks are held if a block has held entries.
 
-    Otherwise a fit of the mean would lead w of one model to z of another past a structure.
+    Otherwise a fit of the mean could connect w of one model to z of another, against a structure.
     """
     found = {}
     for name in {name for cell in cells for name in cell.held if name in whole}:

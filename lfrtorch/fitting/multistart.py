@@ -1,14 +1,22 @@
-"""A fit from several starts: the better half goes on after each of the first rounds.
+"""A fit from several starts: after each of the first rounds, only the better half goes on.
 
-The rounds end at 1/16 and 1/8 of the iterations; the quarter that is left, two at least, goes to
-the end. Four of 16 starts do, and all cost as much as 5 fits. This is successive halving with early
-decisions: on the Bouc-Wen benchmark (16 starts, 5 realisations, 200 iterations) they
-lose little, as starts that come to nothing show at once, and later ones lose the best. Mean of the
-smallest squared validation error: all to the end 3.37 (3026 iterations), half after 1/16 or 1/8
-3.37 (1609, 1696), half after 1/5 3.45, after 3/10 3.48, quarter after 1/16 and 1/8 3.43 (926), an
-eighth after 1/8, 1/4 and 1/2 3.59 (933).
+The first two rounds end at 1/16 and 1/8 of the iterations. A quarter of the starts, but at least
+two, goes to the end: four if there are 16. The whole search then costs as much as 5 complete fits.
 
-The mean of starts that end alike may be better than each of them: see :func:`lfrtorch.mean_model`.
+This is successive halving (Jamieson and Talwalkar) with early decisions. On the Bouc-Wen benchmark
+(16 starts, 5 realisations, 200 iterations) early decisions lose little, as poor starts show at
+once. Later decisions drop the start that would have been the best::
+
+    starts are halved after               least squared validation error, mean   iterations
+    never (all go to the end)                                             3.37         3026
+    1/16 of the iterations                                                3.37         1609
+    1/8                                                                   3.37         1696
+    1/5                                                                   3.45
+    3/10                                                                  3.48
+    1/16 and 1/8 (this module)                                            3.43          926
+    1/8, 1/4 and 1/2                                                      3.59          933
+
+The mean of models that fit alike may be better than each of them: see :func:`lfrtorch.mean_model`.
 
 References:
     Jamieson and Talwalkar, "Non-stochastic best arm identification and hyperparameter
@@ -75,13 +83,13 @@ from lfrtorch.least_squares.shared_problem import same_weights
 from lfrtorch.model.model import Model
 
 ROUNDS = (1 / 16, 1 / 8)
-"""Parts of the iterations after which the worse half is left."""
+"""Parts of the iterations after which the worse half of the starts is dropped."""
 
-_MINUTE = 60.0  # seconds of one core that starts may take together
+_MINUTE = 60.0  # seconds that all starts of starts="auto" may take together on one core
 
 AS_GOOD = 1.01
-"""Ratio of errors up to which a mean of more starts is as good: the best of many iterates of some
-starts is so by luck, too, on the records that chose it."""
+"""Ratio to the least error up to which a mean of more starts counts as equally good. The least
+error of few starts is partly luck, on the records that chose their iterates."""
 
 
 @typed("models")
@@ -105,71 +113,78 @@ def fit(
 ) -> FitResult:
     """Minimise the simulation error of a model over records; from several starts, keep the best.
 
-    The iterate with the smallest error on the validation records (without them: on the training
-    records) is kept, also if the search is interrupted by Ctrl-C, or one of the processes that
-    share the records is lost: ``reason`` then begins with "a process was lost".
+    The iterate with the smallest error on the validation records is kept, or on the training
+    records if there are no validation records. The best iterate so far is also kept if Ctrl-C
+    interrupts the search, or if a process that shares the fit is lost: ``reason`` is then
+    "interrupted" or "a process was lost".
 
-    On a CPU each start is fitted on a thread of its own, as many at a time as torch has threads, on
-    another device one after another.
+    On a CPU each start is fitted on its own thread, with at most as many starts at a time as torch
+    has threads. On another device the starts are fitted one after another.
 
-    At the end the states are scaled to unit rms over the training records, of predictions if they
-    are fitted, and ``model.state_covariance`` is theirs. They keep their coordinates where a record
-    has a start state x0, which is given in these, or where a matrix is frozen
+    At the end the states are scaled to unit rms over the training records, and
+    ``model.state_covariance`` is the covariance of the scaled states. If predictions are fitted,
+    the states are those of the predictions. The states are not scaled if a record has a given
+    start state x0, or if a matrix with a row or column for each state is frozen
     (``requires_grad_(False)``).
 
-    Several processes share the starts if there are as many, else the records of one start after
-    another. Starts that are shared come to the same end as on one process.
+    Several processes share the starts if there are at least as many starts as processes. Otherwise
+    they share the records, and the starts are fitted one after another. Shared starts end at the
+    same models as on one process.
 
     Args:
-        models: where to start: a model, or several of which the best is kept. Their weights are
+        models: models to start from: one, or several of which the best is kept. Their weights are
             changed in place.
         train: records that are fitted.
-        validation: records that choose among the iterates. Of an estimated start as many samples
-            as determine it are not scored; a record that has too few does not choose.
-        selection: more records to judge starts on, and not the iterates of one, best at amplitudes
-            that are not fitted: starts that fit alike differ there (``benchmarks/starts.md``).
-            Starts are judged on validation and selection, and without both on training.
+        validation: records that choose among the iterates. If the start of a record is estimated,
+            the samples that determine it are not scored; a record with too few samples is left out.
+        selection: further records that choose among starts, but not among the iterates of one
+            start. Best are records at amplitudes that are not fitted: starts that fit alike differ
+            there (``benchmarks/starts.md``). Starts are judged on validation and selection records,
+            or on the training records if there are neither.
         trainer: the search. Default: Levenberg-Marquardt.
-        ridge: weight of |θ - θ_start|², see ``lfrtorch.least_squares.problem``. A list has that of
-            each model.
-        noise: where it acts. ``"output"``: on the outputs, and the simulation error is minimised.
-            ``"innovation"``: inside the system, too, and the error of the prediction one sample
-            ahead is minimised; all errors are those of predictions, and the model of the result
-            has K. The models need a K, as ``initialise`` writes it from a linear model of
-            ``estimate_bla(..., refine="prediction")``.
-        horizon: samples of the windows that training records are cut into, each simulated from a
-            start state that is fitted with the parameters (``lfrtorch.fitting.windows``). Errors
-            are then those in windows. Windows of records with a measured start begin at outputs.
+        ridge: weight of |θ - θ_start|², see ``lfrtorch.least_squares.problem``; a list gives each
+            model its own.
+        noise: where noise acts. ``"output"``: on the outputs; the simulation error is minimised.
+            ``"innovation"``: also inside the system; the error of the prediction one sample ahead
+            is minimised. All errors are then those of predictions, and the model of the result
+            has a gain K. The given models need a K, too: ``initialise`` takes it from a linear
+            model of ``estimate_bla(..., refine="prediction")``.
+        horizon: samples of the windows that training records are cut into. Each window is simulated
+            from a start state that is fitted with the parameters (``lfrtorch.fitting.windows``),
+            or from an output if the record has a measured start. Errors are then those in windows.
             Default: whole records.
-        average: most starts that the model of the result is the mean of
-            (:func:`lfrtorch.mean_model`); at least this many go to the end. As many of the best are
-            averaged as bring the mean within 1 % of the least error on validation and selection,
-            which may be one; without such records all are. Starts that diverge when the training
-            input is doubled take no part.
-        monitors: called with the model and its progress after every iteration. For several models,
-            give a list for each; they are called one at a time. Each process calls its own: give
-            those that print or write files to the first alone. Default: a line on a terminal or in
-            a notebook, and nothing elsewhere; ``[]`` for nothing at all.
+        average: largest number of starts whose mean is the model of the result
+            (:func:`lfrtorch.mean_model`); at least this many go to the end. The mean is taken over
+            as many of the best starts as keep its error on validation and selection within 1 % of
+            the least, which may be one start; without such records, over all. Starts that diverge
+            when the training input is doubled take no part.
+        monitors: called with the model and its progress after every iteration, one at a time. For
+            several models, give a list of monitors for each. Each process calls the monitors it was
+            given: give monitors that print or write files to the first process only. Default: a
+            line on a terminal or in a notebook, and nothing elsewhere; ``[]``: nothing at all.
         watch: called after each round.
         ranks: the processes that share starts or training records. Default: those of a
-            ``with distributed.connect():`` around the call. Each calls this function with the same
-            arguments, starts from the first one's weights and returns the same fit. Of starts that
-            others fit, monitors see the best and the last iterate of a round.
-        snapshots: where the starts are kept as far as they came. They go on from there, to the
-            same end as if they had not been interrupted (on the same machine).
-        stop: asked before each iteration; the fit ends there if it returns True, for example
-            ``lambda: time.monotonic() > deadline``. Of several processes one ends all.
+            ``with distributed.connect():`` around the call. Each process calls this function with
+            the same arguments, starts from the weights of the first process and returns the same
+            fit. If another process fits a start, monitors see only its best and its last iterate of
+            each round.
+        snapshots: where the state of each start is saved. Starts go on from a saved state, to the
+            same end as without an interruption (on the same machine).
+        stop: called before each iteration; the fit ends there if it returns True, for example
+            ``lambda: time.monotonic() > deadline``. If one of several processes returns True, all
+            processes end.
 
     Returns:
-        The fit of the best start, its duration that of all. Of several models ``starts`` has all,
-        the best first, and ``averaged`` says of how many the model is the mean.
+        The fit of the best start; its ``seconds`` are the time of all starts together. For several
+        models, ``starts`` lists all of them, the best first, and ``averaged`` is the number of
+        models that were averaged.
 
     Raises:
-        ValueError: no model, none that is stable on the training records at the start, validation
-            records that all have too few samples, fewer starts and records than processes,
-            another number of lists of monitors, known models to average, or predictors of systems
-            with held entries, or another ``noise`` than ``"output"`` and a trainer with a
-            ``guarantee``.
+        ValueError: no model; no model that is stable on the training records before the first
+            iteration; only validation records with too few samples; fewer starts and fewer records
+            than processes; a number of lists of monitors that is not the number of models;
+            ``average`` above 1 with known models, or with predictors of systems that have held
+            entries; a trainer with a ``guarantee`` and ``noise="innovation"``.
         ProcessLostError, StoppedError: before there was an iterate to keep.
 
     Example:
@@ -209,7 +224,7 @@ def fit(
 
 
 def _different(models: Any) -> list[Model]:
-    """The models as a list; refuse one that is none, or has its weights in common with another."""
+    """The models as a list; refuse entries that are not a model, and models that share weights."""
     starts = list(models) if isinstance(models, list | tuple) else [models]
     for number, model in enumerate(starts):
         if not isinstance(model, Model):
@@ -281,11 +296,11 @@ def _fitted(
     if all(one.diverges for one in fits):
         which = "the model diverges" if len(fits) == 1 else "all models diverge"
         raise StartDivergesError(
-            f"{which} on the training records at the start; start from a stable model, or use "
-            "the linear model alone (lfrtorch linear)."
+            f"{which} on the training records before the first iteration; start from a stable "
+            "model, or use the linear model alone (lfrtorch linear)."
         )
     snapshots.restore(fits)
-    clock -= sum(fit.seconds for fit in fits)  # of iterations before an interruption
+    clock -= sum(fit.seconds for fit in fits)  # counts the iterations before an interruption
     unseen = [*validation, *selection]
     field, cut = fits, None
     with ExitStack() as ending:
@@ -307,7 +322,7 @@ def _fitted(
                 field = _drop_others(field, [fits[i] for i in snapshots.rounds[number - 1]])
                 continue
             together.advance(field, until)
-            # Also of a start that was to begin when the fit was asked to end.
+            # This includes a start that had not begun when the fit was asked to end.
             cut = next((fit for fit in field if fit.reason in CUT_SHORT), None)
             field = judge.ranked(field)
             if not field:
@@ -315,7 +330,7 @@ def _fitted(
             watch(Round(number, len(planned), judge.summaries(field), time.perf_counter() - clock))
             if cut is not None:
                 for one in field:
-                    if not one.reason:  # it reached the end of the round
+                    if not one.reason:  # the start reached the end of the round
                         one.note_end(cut.reason, cut.detail)
                 break
             if number < len(planned):
@@ -326,7 +341,7 @@ def _fitted(
         judge.refuse_what_remembers(field, train, begun)
     ranked = judge.ranked(fits)
     result = ranked[0].result()
-    if cut is not None:  # the best start may have come to its end, but not all of those beside it
+    if cut is not None:  # the best start may be complete while others were cut short
         result = replace(result, reason=cut.reason, detail=cut.detail)
     elif result.reason in (Reason.JACOBIAN_VANISHES, Reason.GRADIENT_DIVERGED) and (
         flaw := infinite_slope(result.model, train)
@@ -359,28 +374,28 @@ def _check(starts: Sequence[Model], watching: Sequence[Sequence[Monitor]], avera
     for model in starts:
         if average > 1 and model.lfr.cell.of_system:
             raise InputError(
-                f"average is {average}, and a mean of predictors does not keep what their systems "
-                "hold, as structure, fixed and integrators do; give average=1 or noise='output'."
+                f"average is {average}; a mean of predictors breaks entries that structure, fixed "
+                "or integrators hold in their systems; give average=1 or noise='output'."
             )
         refuse_together(average=average, known="given" if model.known_states else None)
 
 
 def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]:
-    """Number of starts in each round, and the iteration at which it ends."""
+    """Number of starts in each round, and the iteration at which the round ends."""
     parts = ROUNDS if starts > 1 else ()
     planned = []
     for until in sorted({ceil(part * limit) for part in parts} | {limit}):
         planned.append((starts, until))
-        # Two go to the end at least: the best of four after 25 iterations ended in a poor minimum
-        # at one of five realisations of the parallel Wiener-Hammerstein stand-in.
+        # At least two go to the end: the best of four starts after 25 iterations ended in a poor
+        # minimum, for one of five realisations of the parallel Wiener-Hammerstein stand-in.
         starts = min(starts, max(2, average, ceil(starts / 2)))
     return planned
 
 
 def cheap_starts(rows: int, parameters: int, limit: int) -> int:
-    """Number of starts that take about a minute on one core, 8 at most."""
-    # An iteration takes 20 ns for each row and parameter (Bouc-Wen: 8192 samples, 89 parameters,
-    # 14 ms). Measured seconds would make the number depend on the machine.
+    """Number of starts, at most 8, that take about a minute on one core."""
+    # An iteration takes 20 ns for each pair of a row and a parameter (Bouc-Wen: 8192 samples, 89
+    # parameters, 14 ms). If seconds were measured, the number would depend on the machine.
     work = 20e-9 * rows * parameters
     cheap = (n for n in (8, 4, 2) if work * iterations_of(schedule(n, limit)) <= _MINUTE)
     return next(cheap, 1)
@@ -395,7 +410,7 @@ def iterations_of(planned: Sequence[tuple[int, int]]) -> int:
 def line_of(
     models: Sequence[Model], planned: Sequence[tuple[int, int]]
 ) -> ProgressLine | StartsLine:
-    """The line that follows a fit on a terminal or in a notebook; nothing is seen elsewhere."""
+    """The line that shows progress on a terminal or in a notebook, and nothing elsewhere."""
     if len(models) == 1:
         return ProgressLine(every=None)
     unit = common_unit(models[0].outputs)
@@ -405,8 +420,8 @@ def line_of(
 class _Judge:
     """Ranks starts by their best iterates."""
 
-    # Without records that none of them is fitted to, the fits' own validation or training errors
-    # judge, which say nothing of a mean.
+    # Without ``records`` the fits' own validation or training errors rank the starts; these errors
+    # do not tell whether a mean is better.
 
     def __init__(self, fits: Sequence[Fit], records: Sequence[Record], together: Together) -> None:
         self._fits, self._records, self._together = fits, records, together
@@ -424,14 +439,14 @@ class _Judge:
     def refuse_what_remembers(
         self, fits: Sequence[Fit], train: Sequence[Record], start: Model
     ) -> None:
-        """Let models that do not forget where they began lose to all that do."""
+        """Rank starts whose models do not forget their start state behind all others."""
         remember = [not forgets(fit.model, train, start).right for fit in fits]
         for fit, refused in zip(fits, self._same([*map(float, remember)]), strict=True):
             if refused:
                 self._refused.add(id(fit))
 
     def summaries(self, fits: Sequence[Fit]) -> tuple[RestartSummary, ...]:
-        """Say how far each came."""
+        """Return a summary of each start."""
         found = []
         for fit in fits:
             error, best = self._errors.get(id(fit)), fit.kept
@@ -444,16 +459,18 @@ class _Judge:
 
     def stable(self, fits: Sequence[Fit], train: Sequence[Record]) -> list[Model]:
         """Return the models that stay stable on louder inputs, the best first."""
-        # With one that does not, a mean runs away. Rounding may differ between processes, and the
-        # choice must not.
+        # One unstable model makes the mean unstable. Rounding may differ between processes, so the
+        # first process decides.
         models = [fit.model for fit in self.ranked(fits) if id(fit) not in self._refused]
         reach = self._same([largest_stable_amplitude(model, train) for model in models])
         return [model for model, to in zip(models, reach, strict=True) if to >= max(LOUDER)]
 
     def mean(self, best: Sequence[Model]) -> tuple[Model | None, int]:
-        """Return the mean of as many models as do about as well as the best, and of how many."""
-        # None if a single start is better than all means. Without records to judge on, the mean of
-        # all.
+        """Return the mean of the most models whose mean is about as good as the best, and a count.
+
+        The mean is None if a single start is better than all means. Without records to judge on, it
+        is the mean of all models.
+        """
         if not self._records:
             return (mean_model(best), len(best)) if len(best) > 1 else (next(iter(best), None), 1)
         means = [mean_model(best[:count]) for count in range(2, len(best) + 1)]
@@ -463,7 +480,7 @@ class _Judge:
         return (means[count - 2], count) if count > 1 else (None, 1)
 
     def _error(self, model: Model) -> Problem:
-        """Return the same error for starts and means."""
+        """Return the error on which starts and means are compared."""
         return Problem.judge(model, self._records)
 
     def _score(self, fit: Fit) -> float:
@@ -482,7 +499,7 @@ def _cost(error: Problem) -> float:
 
 
 def _drop_others(field: list[Fit], kept: list[Fit]) -> list[Fit]:
-    """The starts that are kept; the others end."""
+    """Return the starts that are kept, and end the others."""
     for fit in field:
         if not (fit.diverges or any(fit is other for other in kept)):
             fit.note_end(Reason.OTHERS_BETTER)

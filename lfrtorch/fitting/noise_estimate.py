@@ -1,4 +1,4 @@
-"""Covariances of the noise inside a system, from records of it."""
+"""Covariances of process and measurement noise of a system, estimated from records."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from lfrtorch.model.model import Model
 
 @typed()
 def estimate_noise(model: Model, records: Record | Sequence[Record]) -> NoiseCovariance:
-    """The noise that an extended Kalman filter of a model needs, from records.
+    """Noise covariances for an extended Kalman filter of a model, estimated from records.
 
-    A model in innovation form has the mean square Λ of the innovations, and then Q = K Λ Kᵀ,
-    S = K Λ and R = Λ. Any other model has diagonal Q and R, those of the greatest likelihood
-    of the records: of the filter's errors one sample ahead, each with the variance that it says.
-    Errors of the model count as noise, too. Skipped samples are not scored in the
-    innovation form; a filter begins at the first sample.
+    For a model in innovation form, Λ is the mean square of the innovations over the records, and
+    Q = K Λ Kᵀ, S = K Λ and R = Λ. For any other model Q and R are diagonal, and maximise the
+    likelihood of the records: the likelihood of the filter's errors one sample ahead, under the
+    variances that the filter computes. Errors of the model count as noise, too. In the innovation
+    form skipped samples are left out; a filter begins at the first sample.
 
-    It takes some hundred passes over the records; a few thousand samples are enough.
+    The maximisation takes some hundred passes over the records; a few thousand samples are enough.
 
     Args:
-        model: it is not changed.
-        records: inputs and measured outputs, best not those of the fit.
+        model: a model; it is not changed.
+        records: inputs and measured outputs; best are records that were not fitted.
 
     Raises:
-        ValueError: records of other channels or another rate.
+        ValueError: records whose channels or rate are not those of the model.
 
     References:
         Ljung, "System Identification: Theory for the User", 2nd ed., 1999, sections 4.3 and 7.4.
@@ -56,7 +56,7 @@ def estimate_noise(model: Model, records: Record | Sequence[Record]) -> NoiseCov
         P0 = model.state_covariance
     x_rms = np.sqrt(np.where(np.diag(P0) > 0.0, np.diag(P0), 1.0))
     y_rms = rms_scale([record.y for record in records], model.scaler.y_offset)
-    unit = np.log(y_rms / model.scaler.y_scale).mean()  # so that the search ends alike in all
+    unit = np.log(y_rms / model.scaler.y_scale).mean()  # so that units do not change where it ends
 
     def noise_of(logarithms: Array) -> NoiseCovariance:
         rms = np.exp(logarithms / 2.0)
@@ -67,8 +67,9 @@ def estimate_noise(model: Model, records: Record | Sequence[Record]) -> NoiseCov
         log_p = sum(model.observer(noise=noise, P0=P0).follow(u, y) for u, y in signals)
         return -log_p / count - unit if np.isfinite(log_p) else np.inf
 
-    # Variances relative to mean squares in the records. The search begins from above, as one that
-    # is far too small makes no difference to the likelihood; eps: of a finite difference.
+    # Variances are relative to mean squares in the records. The search begins at large variances,
+    # as the likelihood hardly depends on a variance that is far too small. eps is the step of the
+    # finite differences.
     first = (1e-4, 1e-2)
     starts = [np.log([q] * nx + [r] * len(y_rms)) for q, r in product(first, first)]
     found = scipy.optimize.minimize(
@@ -79,7 +80,7 @@ def estimate_noise(model: Model, records: Record | Sequence[Record]) -> NoiseCov
 
 
 def _of_innovations(model: Model, records: Sequence[Record]) -> NoiseCovariance:
-    """Return the noise of the innovation form."""
+    """Return the noise covariances of a model in innovation form."""
     assert model.K is not None
     errors = [(record.y - model.predict(record))[record.skip :] for record in records]
     e = np.concatenate(errors)

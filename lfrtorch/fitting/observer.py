@@ -1,4 +1,4 @@
-"""Callbacks of an identification: progress, notes, monitors."""
+"""Callbacks of an identification, for progress, notes and monitors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lfrtorch.model.model import Model
 
 
 class Watching(NamedTuple):
-    """Callback of a fit, see :func:`lfrtorch.fit`.
+    """Callbacks of a fit; see :func:`lfrtorch.fit`.
 
     Args:
         monitors: a list for each start, called after each of its iterations.
@@ -27,7 +27,7 @@ class Watching(NamedTuple):
 
 
 class Observer:
-    """Is told of every step of :func:`lfrtorch.identify`. This one keeps quiet.
+    """Receives a report of every step of :func:`lfrtorch.identify`; this class ignores them all.
 
     Example:
         >>> observer = lfrtorch.Observer()  # for identify(..., observer=observer)
@@ -35,29 +35,29 @@ class Observer:
     """
 
     def say(self, text: str) -> None:
-        """Take a sentence or a table, when it is known."""
+        """Receive a sentence or a table."""
 
     def searching(self) -> Monitor | None:
-        """Monitors of every iteration of the search for sizes; None: a line on a terminal."""
+        """Monitor of every iteration before the final fit; None: a line on a terminal."""
         return lambda model, progress: None
 
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
     ) -> Watching:
-        """Look at what a fit starts from; the settings have the sizes that were chosen."""
+        """Receive the starts of the fit, and return its callbacks; settings have chosen sizes."""
         return Watching([()] * len(models), lambda _: None)
 
     def end(self, result: FitResult) -> None:
-        """Look at the fit."""
+        """Receive the result of the fit."""
 
     def close(self) -> None:
-        """Stop looking on; also if an error or Ctrl-C ended the identification."""
+        """End the reports; also called if an error or Ctrl-C ends the identification."""
 
 
 class LineObserver(Observer):
-    """Shows how far an identification is in one line of a terminal or a notebook.
+    """Shows the progress of an identification in one line on a terminal or in a notebook.
 
-    Elsewhere nothing is shown. :class:`lfrtorch.reporting.Console` prints all that there is to say.
+    Elsewhere nothing is shown. :class:`lfrtorch.reporting.Console` prints all reports.
 
     Example:
         >>> from lfrtorch.fitting.observer import LineObserver
@@ -69,18 +69,18 @@ class LineObserver(Observer):
         self._fit: ProgressLine | StartsLine | None = None
 
     def say(self, text: str) -> None:
-        """Show its first line until there is more to say."""
+        """Show the first line of a text until the next one."""
         self._said.show(text.split("\n", 1)[0])
 
     def searching(self) -> Monitor | None:
-        """Show a line."""
+        """Show the iterations in a line."""
         self._said.close(keep=False)
         return None
 
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
     ) -> Watching:
-        """Follow the iterations."""
+        """Show the iterations of the fit in the line."""
         self._said.close(keep=False)
         planned = schedule(len(models), settings.trainer.limit, settings.average)
         self._fit = line_of(models, planned)

@@ -1,9 +1,10 @@
-"""Starts of one fit that several processes share: each fits some of them to all records.
+"""Starts of one fit that several processes share: each process fits some starts to all records.
 
-A round is cut into legs. At the end of each the processes meet: if one is asked to stop, all do,
-and the first one gets the state of every start, for its snapshots. At the end of a round each takes
-over the starts of the others, to the same bits, so that all judge and choose alike. If a process is
-lost, the others go back to what it had at the end of the leg before.
+A round is cut into legs. At the end of each leg the processes exchange data: if one is asked to
+stop, all stop, and the first process receives the state of every start for its snapshots. At the
+end of a round each process takes over the states of the others' starts, bit-identically, so that
+all processes rank and choose alike. If a process is lost, the others take over the states that its
+starts had at the end of the leg before.
 """
 
 from __future__ import annotations
@@ -23,22 +24,22 @@ from lfrtorch.fitting.side_by_side import Together
 from lfrtorch.fitting.trainer import Fit, Monitor, Stop
 
 SHORT = 10.0
-"""Seconds of a leg below which the next one gets twice the iterations."""
+"""If a leg takes fewer seconds, the next leg has twice the iterations."""
 
 LONG = 60.0
-"""Seconds of a leg above which the next one gets half of the iterations, as a process that waits
-longer than its timeout treats the others as lost."""
+"""If a leg takes more seconds, the next leg has half the iterations. A process that waits longer
+than its timeout treats the others as lost."""
 
 Take = Callable[[int, bytes], None]
 """Called with the number of a start and the state of its fit, as ``Fit.save`` writes it."""
 
 
 class OverProcesses(Together):
-    """Fits of which each process has a share; after ``advance`` each has all of them."""
+    """Fits that the processes share; after ``advance`` each process has the states of all fits."""
 
-    # Monitors are called after each iteration of this process's own fits and, at the end of a
-    # round, with the best and the last iterate of the others'; ``take`` with the others' at the end
-    # of a leg.
+    # Monitors are called after each iteration of this process's own fits. At the end of a round
+    # they are called with the best and the last iterate of the others' fits. ``take`` is called at
+    # the end of a leg with the states of the others' fits.
 
     def __init__(
         self,
@@ -56,11 +57,11 @@ class OverProcesses(Together):
         self._states: dict[int, bytes] = {}
 
     def agreed(self, numbers: Tensor) -> Tensor:
-        """Numbers that decide: those of the first process."""
+        """The numbers of the first process, by which all processes decide."""
         return self.ranks.first(numbers)
 
     def advance(self, fits: Sequence[Fit], until: int) -> None:
-        """Go on with some of them to an iteration, each process with its share."""
+        """Go on with some fits to an iteration, each process with its share."""
         own = self.ranks.share(list(fits))
         others = [fit for fit in fits if not any(fit is mine for mine in own)]
         self._states = {}
@@ -79,7 +80,7 @@ class OverProcesses(Together):
                 fit.note_end(Reason.INTERRUPTED)
 
     def _legs(self, own: Sequence[Fit], until: int, at: int) -> bool:
-        """Go on with a share of them, and meet the others; whether one is asked to stop."""
+        """Go on with this process's fits in legs; return True if a process is asked to stop."""
         while at < until:
             at, clock = min(until, at + self._stride), time.perf_counter()
             if own:
@@ -98,12 +99,13 @@ class OverProcesses(Together):
         return False
 
     def _first_iteration(self, fits: Sequence[Fit]) -> int:
-        """The iteration that they go on from: the first one's, if files were read meanwhile."""
+        """The iteration that all fits go on from, as the first process knows it."""
+        # Processes that read the files of snapshots at different times may differ.
         least = min((fit.state.iteration for fit in fits if fit.state is not None), default=0)
         return int(self.ranks.first(torch.tensor(least)))
 
     def _hand_on(self, own: Sequence[Fit]) -> None:
-        """All processes get the states of each one's fits."""
+        """Send the states of this process's fits to the others, and receive those of their fits."""
         mine: dict[int, bytes] = {}
         for fit in own:
             if fit.state is not None:
@@ -125,7 +127,7 @@ class OverProcesses(Together):
             begin += size
 
     def _take_over(self, others: Sequence[Fit]) -> None:
-        """Go on from the last known states of the others' fits, and show them."""
+        """Put the others' fits at their last known states, and call the monitors."""
         for fit in others:
             state = self._states.pop(self._numbers[id(fit)], None)
             if state is None:

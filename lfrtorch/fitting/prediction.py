@@ -1,4 +1,4 @@
-"""Fits of the prediction one sample ahead: models and records of predictors."""
+"""Fits of the prediction one sample ahead: predictors of models, and the records they need."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from lfrtorch.model.model import Model
 
 
 def without_gain(models: Model | Sequence[Model]) -> Model | list[Model]:
-    """Models whose simulation is fitted: K would be that of the models before the fit."""
+    """Models without K, for a fit of simulations, after which K would be out of date."""
     if isinstance(models, Model):
         return models if models.K is None else replace(models, K=None)
     return [model if model.K is None else replace(model, K=None) for model in models]
 
 
 def without_innovations(model: Model) -> Model:
-    """A model without a gain with one of 0, where a search for one begins at the simulation."""
+    """The model, with K = 0 if it has no K; a search for K then begins at the simulation."""
     cell = model.lfr.cell
     return model if model.K is not None else replace(model, K=cell.A.new_zeros(cell.nx, cell.ny))
 
@@ -27,7 +27,7 @@ def without_innovations(model: Model) -> Model:
 def predicting(
     models: Model | Sequence[Model], *records: Record | Sequence[Record]
 ) -> tuple[Model | list[Model], *tuple[list[Record], ...]]:
-    """The predictors of models, and the records that drive them."""
+    """The predictors of models, and the records that the predictors are simulated on."""
     given = [models] if isinstance(models, Model) else list(models)
     found = [model.predictor() for model in given]
     driven = [[with_past_outputs(r) for r in as_records(part)] if part else [] for part in records]
@@ -37,7 +37,7 @@ def predicting(
 def shown_innovation_form(
     monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] | None,
 ) -> list[Any] | None:
-    """Monitors of a fit of predictors, which see the models of the systems themselves."""
+    """Monitors for a fit of predictors that are called with the models in innovation form."""
     if monitors is None:
         return None
 

@@ -1,10 +1,10 @@
-"""A last fit to all records, once those that were held out have chosen the model.
+"""A last fit to all records, after held-out records have chosen the model.
 
-The fit goes on from the model that was chosen, for as many iterations as the new samples are worth:
-if K iterations over n samples were best on validation, m samples more get K m / n, and no more than
-the fit was allowed. A sample of weight 2, a mean of two periods, counts twice. Many more iterations
-would spoil short records, as K itself stops the fit before it learns their noise. A fit from the
-first start, for K iterations, may end in another minimum, and nothing is left to tell.
+The fit goes on from the chosen model. If K iterations over n samples were best on validation, m
+additional samples get K m / n iterations, but no more than the limit of the first fit. A sample of
+weight 2, a mean of two periods, counts twice. Many more iterations would fit the noise of short
+records, which stopping at K prevents. A fit from the first start for K iterations could end in
+another minimum, and no record would be left to notice.
 """
 
 from __future__ import annotations
@@ -42,26 +42,26 @@ def refit(
     monitor: Monitor | None = None,
     stop: Stop | None = None,
 ) -> FitResult:
-    """Go on with a fit on its training records and those that were held out to choose.
+    """Go on with a fit on its training records and its held-out records together.
 
-    Each model of a mean is fitted, and the mean taken again. The errors on the records
-    that were held out are no validation any more: quote those of ``result``.
+    If the model is a mean, each of its members is fitted and the mean is taken again. Errors on the
+    held-out records are then no longer validation errors: report those of ``result``.
 
     Args:
         result: result of :func:`lfrtorch.fit`; its model is copied.
-        train: records that it was fitted to.
-        held_out: records that chose its iterate. One that begins in a training record, as the
-            parts of a measurement do, continues that record.
-        trainer, ridge, noise, horizon: as in the fit; ridge pulls towards the chosen model.
-        iterations: that were chosen. Default: those of the fit, without what came before it.
+        train: records that the first fit was fitted to.
+        held_out: records that chose its iterate. A record whose skipped samples are the end of a
+            training record, as in parts of one measurement, is joined to that record.
+        trainer, ridge, noise, horizon: as in the first fit; ridge pulls towards the chosen model.
+        iterations: number of iterations that were best on validation. Default: that of ``result``.
         monitor: called after every iteration. Default: a line on a terminal or in a notebook.
         stop: see :func:`lfrtorch.fit`.
 
     Returns:
-        The fit to all records; that of the models as they are if no iteration was chosen.
+        The fit to all records. If the start was best on validation, the models do not change.
 
     Raises:
-        ValueError: records of other channels than the model's.
+        ValueError: records whose channels are not those of the model.
         ProcessLostError, StoppedError: before there was an iterate to keep.
 
     Example:
@@ -97,12 +97,12 @@ def refit(
 
 
 def estimation_records(dataset: Dataset) -> list[Record]:
-    """Records of a second fit: all but the tests."""
+    """Records of a second fit: all but the test records."""
     return all_records(dataset.train, [*dataset.validation, *dataset.selection])
 
 
 def all_records(train: Sequence[Record], held_out: Sequence[Record]) -> list[Record]:
-    """Training records and others; one that begins in a training record continues that one."""
+    """Training and held-out records; a record that continues a training record is joined to it."""
     found = list(train)
     for record in held_out:
         at = next((i for i, other in enumerate(found) if _continues(record, other)), None)
@@ -114,7 +114,7 @@ def all_records(train: Sequence[Record], held_out: Sequence[Record]) -> list[Rec
 
 
 def _continues(record: Record, other: Record) -> bool:
-    """Tell if the samples that a record skips are the last ones of another."""
+    """Tell if the samples that a record skips are the last samples of another record."""
     count = min(record.skip, other.samples)
     if not count or "periodic" in (record.start, other.start):
         return False

@@ -1,4 +1,4 @@
-"""All choices of an identification, checked before anything is computed."""
+"""All settings of an identification, checked before anything is computed."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from lfrtorch.model.known import Known
 from lfrtorch.model.model import Model
 
 LAST_SIZE = {"network": "nn", "polynomial": "degree"}
-"""The third size of a static nonlinearity, after nz and nw."""
+"""Name of the third size of a static nonlinearity, after nz and nw."""
 
 SEED_STEP = 1000
-"""Distance of the seeds of several starts."""
+"""Difference between the seeds of successive starts."""
 
 
 @typed("init_from", "trainer", "static", "known", "nx", "nz", "nw", "nn", "degree", "starts")
@@ -42,7 +42,7 @@ class Settings(PlainSettings):
     """Settings of an identification; see :func:`lfrtorch.identify`.
 
     Raises:
-        ValueError: a setting that cannot be, or two that exclude each other.
+        ValueError: an invalid setting, or two settings that exclude each other.
 
     Example:
         >>> settings = lfrtorch.Settings(nx=2, nn="auto", starts=3)
@@ -52,33 +52,33 @@ class Settings(PlainSettings):
 
     static: Literal["network", "polynomial"] | Callable[..., Module] = setting(
         "network",
-        '``"network"``, ``"polynomial"``, or what makes a map of one\'s own: called with the '
-        "keywords nz and nw it returns a module from (..., nz) to (..., nw), for example the "
-        "module's class.",
+        '``"network"``, ``"polynomial"``, or a callable that makes a map of your own, such as a '
+        "module's class: called with the keywords nz and nw, it returns a module from (..., nz) to "
+        "(..., nw).",
     )
     known: Known | None = setting(
         None,
-        "a model of the physics; nz, nw and nn or degree are those of the map that is learned "
-        "beside it (nn=0: none), and nx the states beside its own; auto: nn and nx are 0, z is all "
-        "that it sees and w all that it acts on. Default: nothing is known.",
+        "a model of the physics. nz, nw and nn or degree are then the sizes of the map learned "
+        "beside it (nn=0: no map), and nx is the number of states learned beside its own. If they "
+        "are auto, nn and nx are 0, and z and w have all that it sees and acts on. Default: none.",
     )
     fixed: Mapping[str, Any] = setting(
         dict,
-        "entries of the matrices that are given, with u and y in physical units, "
-        '``{"Cy": [[1.0, 0.0]]}``; NaN for those that are free. The start is put into coordinates '
-        "that have them; sizes that are auto follow from the shapes.",
+        'given entries of matrices, with u and y in physical units, ``{"Cy": [[1.0, 0.0]]}``; NaN '
+        "marks free entries. The start is transformed to state coordinates that have these "
+        "entries; sizes that are auto follow from the shapes.",
     )
     linear: Mapping[str, Any] = setting(
         dict, 'options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.'
     )
     trainer: Trainer = setting(LevenbergMarquardt, "the search. Default: Levenberg-Marquardt.")
     init_from: Model | None = setting(
-        None, "a model to go on from, in place of ``init``; its sizes replace those given here."
+        None, "model to start from, in place of ``init``; its sizes replace those given here."
     )
-    dtype: torch.dtype = setting(torch.float64, "of the fit: float64 or float32.")
+    dtype: torch.dtype = setting(torch.float64, "dtype of the fit: float64 or float32.")
 
     def __new__(cls, *_: Any, **given: Any) -> Settings:
-        """Refuse what is the trainer's, and say where it goes."""
+        """Refuse options of the trainer, with the advice to give them to the trainer."""
         options, own = (signature(kind).parameters for kind in (LevenbergMarquardt, cls))
         for name, value in given.items():
             if name in options and name not in own:
@@ -117,16 +117,16 @@ class Settings(PlainSettings):
         else:
             if self.ridge == "auto":
                 raise InputError(
-                    "ridge is auto, and the model of init_from has seen what would be left out to "
-                    "choose it; give a number."
+                    "ridge is auto, but the model of init_from was fitted to the samples that "
+                    "would be left out to choose it; give a number."
                 )
             for name, size in self.init_from.sizes.items():
                 object.__setattr__(self, name, size)
         refuse_together(**self._that_exclude())
         if self.average > 1 and not self.averages:
             raise InputError(
-                f"average is {self.average}, and a mean of predictors does not keep what their "
-                "systems hold, as structure and fixed do; give average=1 or noise='output'."
+                f"average is {self.average}; a mean of predictors breaks entries that structure or "
+                "fixed hold in their systems; give average=1 or noise='output'."
             )
         if self.noise != "output" and not np.any(self.linear.get("integrators", 0)):
             refine = self.linear.get("refine") or "prediction"
@@ -148,7 +148,7 @@ class Settings(PlainSettings):
             ) from None
 
     def _complete_known(self, known: Known) -> None:
-        """Sizes that are auto: nothing is learned, or z and w have all it sees and acts on."""
+        """Set sizes that are auto: nx and nn to 0, nz and nw to all that it sees and acts on."""
         nx = 0 if self.nx in (None, "auto") else cast(int, self.nx)
         states = [name for name in known.acts_on if name != "y"]
         rule = {"nx": nx, "nz": nx + len(known.sees), "nw": nx + max(1, len(states)), "nn": 0}
@@ -159,7 +159,7 @@ class Settings(PlainSettings):
             object.__setattr__(self, "ridge", 0.0)
 
     def _take_given_sizes(self) -> None:
-        """Sizes that are auto follow from the matrices of ``fixed`` that have them."""
+        """Set sizes that are auto to those of the matrices in ``fixed``."""
         for name, value in self.fixed.items() if isinstance(self.fixed, Mapping) else ():
             for axis, size in zip(MATRICES.get(name, ()), np.shape(value), strict=False):
                 if getattr(self, f"n{axis}", None) != "auto":
@@ -169,14 +169,14 @@ class Settings(PlainSettings):
                 object.__setattr__(self, f"n{axis}", of_linear if axis == "x" else size)
 
     def _check_known(self) -> None:
-        """Refuse what is not for a known model."""
+        """Refuse settings that a known model cannot have."""
         integer("nx", self.nx, 0)
         integer("nn", self.nn, 0)
         driven = self.relaxations + 2 * self.modes
         if driven and self.static == "network" and not self.nn:
             raise InputError(
-                f"relaxations is {self.relaxations} and modes is {self.modes}, and nothing beside "
-                "the known model has a w that drives their states; give nn=6, for example."
+                f"relaxations is {self.relaxations} and modes is {self.modes}, but no map learned "
+                "beside the known model has a w to drive their states; give nn=6, for example."
             )
 
     def _check_sizes(self) -> None:
@@ -189,13 +189,13 @@ class Settings(PlainSettings):
             if getattr(self, name) == "auto":
                 used = self.size_names[-1]
                 raise InputError(
-                    f"{name} is auto, and this static map has none; give {used}='auto'."
+                    f"{name} is auto, but this static map has no {name}; give {used}='auto'."
                 )
 
     def _that_exclude(self) -> dict[str, Any]:
-        """Return the settings that may exclude each other, those of parts by their own names.
+        """Return the settings that may exclude each other, including guarantee and integrators.
 
-        A model of ``init_from`` has a static map, sizes and a structure of its own.
+        Static map, sizes and structure are left out if the model of ``init_from`` has its own.
         """
         own = (
             {"static", "structure", "nz", "nw", "nn", "degree"}
@@ -208,40 +208,40 @@ class Settings(PlainSettings):
 
     @property
     def known_states(self) -> int:
-        """Number of states of the known model, of the settings or of ``init_from``; 0 for none."""
+        """Number of states of the known model, in the settings or ``init_from``; 0 without one."""
         if self.init_from is not None:
             return self.init_from.known_states
         return 0 if self.known is None else len(self.known.states)
 
     @property
     def learns(self) -> bool:
-        """True if a map or states are learned; beside a known model, those of the learned part."""
+        """True if a map or states are learned, be it beside a known model."""
         return self.known is None or bool(self.nn or self.nx or self.static != "network")
 
     @property
     def averages(self) -> bool:
-        """True if a mean of models keeps held entries of their systems: not that of predictors."""
+        """True if a mean of models keeps entries held in their systems; some predictors do not."""
         integrates = bool(np.any(self.linear.get("integrators", 0)))
         holds = self.structure not in ("free", "hammerstein") or not {*TIED}.isdisjoint(self.fixed)
         return self.noise == "output" or not (holds or integrates)
 
     @property
     def states(self) -> Size | None:
-        """Number of states of a start from a linear model."""
+        """Number of states of a start that is made from a linear model."""
         if not isinstance(self.nx, int):
             return self.nx
         return self.nx * (1 + (self.structure in IN_SERIES)) + self.relaxations + 2 * self.modes
 
     @property
     def size_names(self) -> tuple[str, ...]:
-        """Sizes of the static nonlinearity: nz, nw, and nn or degree."""
+        """Names of the sizes of the static nonlinearity: nz, nw, and nn or degree."""
         if self.init_from is not None:
             return tuple(n for n in self.init_from.sizes if n != "nx")
         return ("nz", "nw", *(size for kind, size in LAST_SIZE.items() if self.static == kind))
 
     @property
     def searched(self) -> tuple[str, ...]:
-        """Names of what cross-validation chooses: sizes of the map, and the ridge with them."""
+        """Names of the settings that cross-validation chooses: sizes of the map, and the ridge."""
         return tuple(name for name in (*self.size_names, "ridge") if getattr(self, name) == "auto")
 
     @property
@@ -251,7 +251,7 @@ class Settings(PlainSettings):
 
     @property
     def used(self) -> dict[str, Any]:
-        """Sizes, ridge, starts and iterations by name, as numbers where the data have chosen."""
+        """Sizes, ridge, starts and iterations by name, with the numbers that were chosen."""
         names = ("ridge", "starts", "average", "seed")
         numbers = {name: getattr(self, name) for name in names}
         if isinstance(self.ridge, Mapping):
@@ -260,15 +260,15 @@ class Settings(PlainSettings):
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Seeds of the starts; neighbouring values of ``seed`` have none in common."""
+        """Seeds of the starts; two values of ``seed`` less than 1000 apart share no start."""
         return self.first_seeds(1 if self.starts == "auto" else self.starts)
 
     def first_seeds(self, count: int) -> tuple[int, ...]:
-        """Seeds of so many starts."""
+        """Seeds of the first ``count`` starts."""
         return tuple(self.seed + SEED_STEP * number for number in range(count))
 
     def static_map(self) -> dict[str, Any]:
-        """The static map for :func:`lfrtorch.initialise`, if it is not the network."""
+        """The static map as a keyword of :func:`lfrtorch.initialise`; empty for a network."""
         if self.static == "network":
             return {}
         assert isinstance(self.nz, int)

@@ -15,12 +15,12 @@ from lfrtorch.model.model import Model
 
 
 def any_of(halt: Event, stop: Stop | None) -> Stop:
-    """Return what stops if one of the two says so."""
+    """Return a ``Stop`` that is True if ``halt`` is set or ``stop`` returns True."""
     return lambda: halt.is_set() or (stop is not None and stop())
 
 
 class Together:
-    """Fits side by side, and who watches them; ``halt`` is set if Ctrl-C ends one thread."""
+    """Fits side by side, and their monitors; ``halt`` is set if Ctrl-C ends one thread."""
 
     def __init__(
         self, fits: Sequence[Fit], monitors: Sequence[Sequence[Monitor]], halt: Event
@@ -33,11 +33,11 @@ class Together:
         }
 
     def agreed(self, numbers: Tensor) -> Tensor:
-        """Numbers that decide: those of the first process."""
+        """The numbers of the first process, by which all processes decide."""
         return self._first.problem.agreed(numbers)
 
     def advance(self, fits: Sequence[Fit], until: int) -> None:
-        """Go on with some of them to an iteration."""
+        """Go on with some fits to an iteration."""
         first = fits[0]
         theta = first.problem.theta
         threads = worth_threads(first.problem.size, len(theta))
@@ -59,7 +59,7 @@ class Together:
         if fit.history or not fit.stopped():
             fit.advance(until, self._monitors[id(fit)])
         if fit.reason == Reason.INTERRUPTED:
-            self._halt.set()  # Ctrl-C is for those as well that wait for their turn
+            self._halt.set()  # Ctrl-C also ends the fits that wait for a thread
 
     def _in_turn(self, monitor: Monitor) -> Monitor:
         def call(model: Model, progress: Progress) -> None:

@@ -1,4 +1,4 @@
-"""The choice of sizes and ridge, on all records but the tests, before the fit."""
+"""The choice of sizes and ridge before the fit, on all records but the test records."""
 
 from __future__ import annotations
 
@@ -25,24 +25,25 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.model import Model
 
 _CHOOSING = 20_000
-"""Training samples that sizes are chosen with, at most."""
+"""Largest number of training samples that sizes are chosen on."""
 
 _MEMBERS = 8
 """Most starts that a model of chosen sizes is the mean of."""
 
 _ITERATIONS = 75
-"""Iterations of a fit without validation: about as many as its ridge was chosen with."""
+"""Largest number of iterations of the fit after the choice, which has no validation records: about
+as many as its ridge was chosen with."""
 
 
 class Sizes(Stage):
-    """Sizes and ridge that are ``"auto"``, by cross-validation."""
+    """Chooses the sizes and the ridge that are ``"auto"`` by cross-validation."""
 
     def when(self, job: Job) -> bool:
         """Tell if any of them is ``"auto"``."""
         return bool(job.settings.searched)
 
     def run(self, job: Job) -> Job:
-        """Choose, and estimate the linear models again: all records but the tests are fitted."""
+        """Choose, and estimate the linear models again from all records but the test records."""
         train = estimation_records(job.dataset)
         dataset = replace(job.dataset, train=train, validation=[], selection=[])
         choice = _choice(replace(job, dataset=dataset))
@@ -58,7 +59,7 @@ class Sizes(Stage):
 
 
 def _of_choice(settings: Settings, choice: Choice) -> Settings:
-    """The settings with what was chosen; the fit has no validation records."""
+    """The settings with the chosen values; the fit has no validation records."""
     trainer: Any = settings.trainer
     sizes = {name: choice.chosen.sizes[name] for name in settings.size_names}
     if settings.known is None:
@@ -85,7 +86,7 @@ def _choice(job: Job) -> Choice:
     orders = job.order_scan.orders if job.order_scan else ()
     asked = {**settings.sizes, "nx": of_linear_model(settings).nx}
     given = {name: size for name, size in asked.items() if isinstance(size, int)}
-    equations = dict[int, Job]()  # fitted without each stretch, by its linear model
+    equations = dict[int, Job]()  # known model fitted without a stretch, by its linear model's id
     approximated = linear_records(records, settings, Observer())
     at_outputs = begins_at_outputs(records)
 

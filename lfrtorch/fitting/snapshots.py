@@ -1,4 +1,4 @@
-"""Snapshots of the starts of a fit on disk, from which a program can continue."""
+"""Snapshots of the starts of a fit on disk, from which an interrupted fit can continue."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ _ROUNDS = "rounds.json"
 
 
 class Snapshots:
-    """A folder with a file for each start, and one that says which went on after each round.
+    """A folder with a file for each start, and a file that lists the starts kept after each round.
 
     Args:
-        folder: where they are; without one nothing is kept.
-        every: least seconds between two files of one start; there is one at each of its ends.
-        writes: write files; the first of several processes does.
+        folder: folder of the files. Default: nothing is saved.
+        every: shortest time in seconds between two writes for one start; a start is also written
+            at the end of each round.
+        writes: True if this process writes files; of several processes only the first one should.
 
     Raises:
         ValueError: damaged files.
@@ -68,7 +69,7 @@ class Snapshots:
         return min((at["history"][at["chosen"]]["score"] for at in found), default=math.inf)
 
     def restore(self, fits: Sequence[Fit]) -> None:
-        """Restore the fits that had begun; refuse other fits with a ValueError."""
+        """Restore the fits that have files; raise a ValueError if the number of starts differs."""
         if self.folder is None:
             return
         if self._count is None:
@@ -76,15 +77,15 @@ class Snapshots:
             self._write()
         if self._count != len(fits):
             raise InputError(
-                f"the run that is to go on has {self._count} start(s), and now there are "
-                f"{len(fits)}; go on with as many, or begin a new run."
+                f"the run to be continued has {self._count} start(s), but {len(fits)} are given; "
+                f"give {self._count}, or begin a new run."
             )
         for number, fit in enumerate(fits):
             if self._file(number).is_file():
                 fit.restore(self._file(number))
 
     def keeper(self, number: int) -> Keep:
-        """Return a monitor that writes the file of a start when it is due."""
+        """Return a function that writes the file of a start when a write is due."""
         due = monotonic() + self.every
 
         def keep(fit: Fit, paused: bool) -> None:
@@ -96,7 +97,7 @@ class Snapshots:
         return keep
 
     def take(self, number: int, state: bytes) -> None:
-        """Write the file of a start that another process fits."""
+        """Write the file of a start that another process has fitted."""
         if self._writes:
             with whole_file(self._file(number)) as fresh:
                 fresh.write_bytes(state)

@@ -1,6 +1,6 @@
-"""Stages of an identification, each a file: what comes before a fit, the fits, and what follows.
+"""Stages of an identification: steps before a fit, fits, and steps after a fit.
 
-A fit says when it is made, to which data, by which trainer, and what is kept of it:
+A stage that is a fit defines when it runs, its models, data and trainer, and what it keeps:
 
     class Reweighted(Stage):
         name = "the fit to records weighted by their errors"
@@ -14,9 +14,9 @@ A fit says when it is made, to which data, by which trainer, and what is kept of
         def keep(self, job, result):
             return replace(job, result=replace(job.result, model=result.model))
 
-A stage before ``WholeFit`` leaves ``models``, where that begins; one after it goes on from
-``result``. Others override ``run``. ``stages.STAGES`` has them all in their order, and asks no more
-of them.
+A stage before ``WholeFit`` sets ``models``, where the fit begins. A stage after it goes on from
+``result``. A stage that is not a fit overrides ``run``. ``stages.STAGES`` lists all stages in their
+order; a new stage needs no other entry.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ from lfrtorch.linear.order_scan import OrderScan
 from lfrtorch.model.model import Model
 
 _LATER: Any = None
-"""Value of a field that a later stage fills."""
+"""Placeholder for a field that a later stage sets."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """An identification as far as it has come; the settings have what was chosen so far.
+    """The state of an identification; its settings include the values chosen so far.
 
     Args:
         given: records by use, as they were given.
-        dataset: the same with the windows of their scores.
+        dataset: the same records, with their score windows.
         settings, observer, stop, snapshots: see :func:`lfrtorch.identify`.
         linear: the best linear approximation.
         begun: that of the order that models start with.
@@ -75,7 +75,7 @@ class Job:
     again: FitResult | None = None
 
     def fit(self, models: Sequence[Model], data: Data, **options: Any) -> FitResult:
-        """A fit with the settings, but for the options."""
+        """Fit with the settings; ``options`` replace single settings."""
         own = {name: getattr(self.settings, name) for name in ("noise", "horizon")}
         own["ridge"] = self.settings.ridge if self.ridge is None else self.ridge
         return fit(models, *data, **{**own, "stop": self.stop, **options})
@@ -90,25 +90,25 @@ class Data(NamedTuple):
 
     @classmethod
     def of(cls, dataset: Dataset) -> Data:
-        """Those of a dataset."""
+        """Training, validation and selection records of a dataset."""
         return cls(dataset.train, dataset.validation, dataset.selection)
 
 
 class Stage:
-    """One of them; a fit, unless it overrides ``run``."""
+    """A stage of an identification; it is a fit, unless it overrides ``run``."""
 
     name = ""
     """Name of the stage, after "stopped during"."""
 
     def check(self, job: Job) -> None:
-        """Refuse what cannot be, before anything is computed."""
+        """Refuse invalid settings before anything is computed."""
 
     def when(self, job: Job) -> bool:
-        """Tell if the stage takes part."""
+        """Tell if the stage runs."""
         return True
 
     def models(self, job: Job) -> Sequence[Model]:
-        """Where it starts."""
+        """Models that the fit starts from."""
         return job.models
 
     def data(self, job: Job) -> Data:
@@ -116,20 +116,21 @@ class Stage:
         return Data.of(job.dataset)
 
     def trainer(self, job: Job) -> Trainer:
-        """The search."""
+        """Trainer of the fit."""
         return job.settings.trainer
 
     def options(self, job: Job) -> Mapping[str, Any]:
-        """Other keywords of its fit, in place of the settings."""
+        """Keywords of the fit that replace settings."""
         return {}
 
     def keep(self, job: Job, result: FitResult) -> Job:
-        """Keep the result of the fit."""
+        """The job with what is kept of the result."""
         raise NotImplementedError
 
     def run(self, job: Job) -> Job:
         """The job after the stage."""
-        # One that is cut short leaves the whole fit, if there is one, with that for its reason.
+        # If this fit is cut short, the result of the whole fit, if there is one, is kept and gets
+        # this fit's reason.
         monitor, models = job.observer.searching(), self.models(job)
         result = job.fit(
             models,

@@ -1,4 +1,4 @@
-"""Where the fits of an identification start: a given model, or a linear one with static maps."""
+"""Starts of the fits of an identification: a given model, or a linear model with static maps."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class FromModel(Stage):
     """The model of ``init_from``."""
 
     def check(self, job: Job) -> None:
-        """Refuse a model of other channels."""
+        """Refuse a model whose channels are not those of the records."""
         if job.settings.init_from is not None:
             check_channels(job.settings.init_from, job.given.train[0])
 
@@ -40,7 +40,7 @@ class FromModel(Stage):
         return job.settings.init_from is not None
 
     def run(self, job: Job) -> Job:
-        """Start there alone."""
+        """Start from this model alone."""
         settings = job.settings
         if settings.starts not in (1, "auto"):
             job.observer.say("note: starts is 1: the fit starts from the model of init_from alone")
@@ -54,7 +54,7 @@ class FromLinear(Stage):
     """The linear model with random static maps, one for each start."""
 
     def when(self, job: Job) -> bool:
-        """Tell if no other start is given."""
+        """Tell if neither a start model nor a known model is given."""
         return job.settings.init_from is None and job.settings.known is None
 
     def run(self, job: Job) -> Job:
@@ -93,10 +93,10 @@ def _members(job: Job, choice: Choice) -> Job:
 def starting_model(
     train: Sequence[Record], settings: Settings, linear: LinearModel, seed: int
 ) -> Model:
-    """The model that one start begins with."""
+    """The model of one start."""
     names = {one.name for one in fields(PlainSettings)} & {*signature(initialise).parameters}
     options = {name: getattr(settings, name) for name in names}
-    with torch.random.fork_rng(devices=[]):  # maps draw their weights as torch modules do
+    with torch.random.fork_rng(devices=[]):  # a caller's module may draw from torch's generator
         torch.manual_seed(seed)
         options |= settings.static_map()
     model = initialise(linear, train, **options | {"method": settings.init, "seed": seed})

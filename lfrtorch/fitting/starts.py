@@ -1,4 +1,4 @@
-"""Best linear approximation -> weights of an NL-LFR model that starts exactly there."""
+"""Weights of an NL-LFR model whose output is at first that of a best linear approximation."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from lfrtorch.maps.network import Network
 from lfrtorch.model.model import Model
 
 _OUTPUT_RANGE = 0.3
-"""Bw, Dyw ~ U(-0.3, 0.3) of the ``"zero_output"`` start."""
+"""Range of the ``"zero_output"`` start: Bw, Dyw ~ U(-0.3, 0.3)."""
 
 _RUNAWAY = 1e38
-"""Normalised states whose eighth power, in polynomials, is still a number."""
+"""Largest normalised state; its eighth power, in a polynomial, is still finite."""
 
 
 @typed("dtype")
@@ -53,68 +53,72 @@ def initialise(
     structure: str = "free",
     dtype: torch.dtype = torch.float64,
 ) -> Model:
-    """NL-LFR model whose output is that of the linear model.
+    """Make an NL-LFR model whose output is that of the linear model.
 
-    ``"zero_output"`` first speeds up modes of the linear model that add next to nothing to the
-    output and are slower than all others (:func:`lfrtorch.linear.modes.without_slow_minor_modes`),
-    unless it has a noise model, or the records have a measured start.
+    ``"zero_output"`` first speeds up modes of the linear model that are slower than all others and
+    add next to nothing to the output (:func:`lfrtorch.linear.modes.without_slow_minor_modes`). It
+    does not if the linear model has a noise model, or if a record has a measured start.
 
-    Signals and states are scaled to unit standard deviation over the records, and so is every z:
-    C*, D* ~ U(-1, 1), then Cz, Dzu = C*, D* over the standard deviation of C* x + D* u. The static
-    map is a ``Network`` with its own draw (Wz and bz ~ U(-1, 1), bw = 0), or a module of the
-    caller's own with its weights as they are. The two methods differ in what keeps w out of the
-    start:
+    Signals, states and every z are scaled to unit standard deviation over the records. For z, C*
+    and D* are drawn from U(-1, 1), and Cz, Dzu are C*, D* over the standard deviation of
+    C* x + D* u. The static map is a ``Network`` with random weights (Wz and bz ~ U(-1, 1), bw = 0),
+    or a module of the caller's own with its given weights. The two methods differ in what makes the
+    contribution of w zero:
 
     - ``"paper"``: Bw = Dyw = 0 and Ww ~ U(-1, 1) (Schoukens and Tóth 2020);
-    - ``"zero_output"``: Ww = 0 and Bw, Dyw ~ U(-0.3, 0.3) (after Schoukens 2021), for a polynomial
-      C = 0. The more reliable one. A module of another class starts so if its output vanishes on
-      the data, with the weights that it has, and else as with ``"paper"``.
+    - ``"zero_output"``: Ww = 0 and Bw, Dyw ~ U(-0.3, 0.3) (after Schoukens 2021); for a polynomial
+      C = 0. This method is more reliable. For a module of another class it applies only if the
+      module's output with its given weights is zero on the data; otherwise Bw = Dyw = 0.
 
-    If a static map of the linear model's output explains most of its error, as in a Wiener system,
-    ``"zero_output"`` begins there: the first z are the linear model's outputs, and Bw = 0. If one
-    of its input does, as in a Hammerstein system, the first z are the inputs.
+    If a static map of the linear model's output explains most of the model's error, as in a Wiener
+    system, ``"zero_output"`` begins there: the first z are the linear model's outputs, and Bw = 0.
+    If a static map of the input does, as in a Hammerstein system, the first z are the inputs.
 
-    ``relaxations`` and ``modes`` add states that w alone drives. A relaxation is a real pole, which
-    z sees, too: hysteresis is made of them. Their corner frequencies are spread over two decades up
-    to half the band of the inputs. Modes are lightly damped, above the band of the inputs, where
-    the linear model has none; their frequencies split the power of its errors there into equal
-    parts. Friction, clearance and impacts excite such modes of a structure.
+    ``relaxations`` and ``modes`` add states that w alone drives. A relaxation is a real pole whose
+    state z sees; relaxations describe hysteresis. Their corner frequencies are spread over two
+    decades up to half the band of the inputs. Modes are lightly damped, above the band of the
+    inputs, where the linear model has no modes. Their frequencies split the power of the linear
+    model's errors there into equal parts. Friction, clearance and impacts excite such modes of a
+    structure.
 
-    Exact integrators of the linear model (``estimate_bla(..., integrators=1)``) stay so: no z sees
-    their states, and a fit leaves those columns of A and Cz as they are. Without ``z_feedthrough``
-    Dzu is 0, and a fit of this model leaves it so: the nonlinearity sees the states alone. Without
-    ``feedthrough`` the input does not act on the output at once, neither by Dyu nor through w: then
-    Dyw is 0 as well, unless Dzu is. It must be so for data under feedback whose loop has no delay.
+    Exact integrators of the linear model (``estimate_bla(..., integrators=1)``) stay exact: no z
+    sees their states, and a fit does not change their columns of A and Cz. Without
+    ``z_feedthrough`` Dzu is 0, and a fit keeps it 0: the nonlinearity depends on the states alone.
+    Without ``feedthrough`` the input does not act on the output at once, neither by Dyu nor through
+    w: Dyw is then 0 as well, unless Dzu is 0. Data from a feedback loop without a delay need this.
 
-    ``structure`` makes the model of blocks, and a fit of it keeps to them: a static map of what is
-    made of the linear model's states acts on the output alone (``"wiener"``); one of the inputs
-    drives them (``"hammerstein"``); or it stands between the linear model and a second set of
-    states, a copy of the linear model's that w alone drives (``"wiener_hammerstein"``), so that nx
-    doubles. ``"parallel"`` is the latter with a map of nz = nw functions of one z each. In all of
-    these w never comes back to z.
+    ``structure`` gives the model a block structure, which a fit keeps. In all structures but
+    ``"free"``, w never acts on z:
+
+    - ``"wiener"``: w acts on the output alone, and z is made of the linear model's states;
+    - ``"hammerstein"``: z is made of the inputs alone;
+    - ``"wiener_hammerstein"``: w alone drives a second set of states, a copy of those of the linear
+      model, so that nx doubles;
+    - ``"parallel"``: as ``"wiener_hammerstein"``, with a map of nz = nw functions of one z each.
 
     Args:
         bla: stable linear model, best in balanced coordinates.
         records: the data that are to be fitted.
         nz, nw: inputs and outputs of the static nonlinearity.
-        nn, activation: neurons of the network and their function.
-        static: the map z -> w in the network's place, copied: a ``Network``, a ``Polynomial`` or
-            any module from (..., nz) to (..., nw); nn and activation are then of no use.
-        method: one of the two starts.
+        nn, activation: number of neurons of the network, and their function.
+        static: the map z -> w in place of the network, which is copied: a ``Network``, a
+            ``Polynomial`` or any module from (..., nz) to (..., nw); nn and activation are ignored.
+        method: how the contribution of w is made zero.
         seed: seed of the random weights.
-        relaxations, modes: numbers that are added to those of the linear model, one and two states
-            each.
-        z_feedthrough: the input acts on z at once.
-        feedthrough: it acts on the output at once; if not, the linear model has D = 0.
+        relaxations, modes: how many relaxations (one state each) and modes (two states each) are
+            added to the linear model.
+        z_feedthrough: True if the input acts on z at once.
+        feedthrough: True if the input acts on the output at once; if False, the linear model must
+            have D = 0.
         structure: ``"free"``, ``"wiener"``, ``"hammerstein"``, ``"wiener_hammerstein"`` or
             ``"parallel"``.
         dtype: dtype of the weights.
 
     Raises:
-        ValueError: sizes below 1, or so large that a fit takes more memory than there is, a dtype
-            that is no float32 or float64, an unknown method, a static map of other sizes, modes and
-            no errors above the band of the inputs, nothing that z may see, a linear model with
-            feedthrough for a model without, or an unstable one that runs away.
+        ValueError: sizes below 1, or so large that a fit needs more memory than there is; a dtype
+            that is not float32 or float64; an unknown method; a static map of other sizes; modes,
+            but no errors above the band of the inputs; no state or input that z may see;
+            ``feedthrough=False`` and a linear model with D; or a linear model that runs away.
 
     References:
         Schoukens and Tóth, IFAC-PapersOnLine 53(2), 2020, section 4.2.
@@ -144,7 +148,7 @@ def initialise(
     if not feedthrough:
         _check_no_feedthrough(bla, structure, z_feedthrough)
     data = [without_coordinates(record) for record in as_records(records)]
-    # Noise has slow modes, and outputs that tell the states tell those of all modes.
+    # Slow modes are kept if they model noise, or if measured outputs determine their states.
     told = bla.K is not None or any(record.start == "measured" for record in data)
     if method != "paper" and not told:
         bla = without_slow_minor_modes(bla, data)
@@ -187,7 +191,7 @@ def initialise(
         std = _deviation(x)
         if not (x.abs() < _RUNAWAY).all():
             raise InputError(
-                "the linear model is unstable, and runs away in a simulation of a record; give a "
+                "the linear model is unstable, and its simulation of a record runs away; give a "
                 "horizon with start='measured', or shorter records."
             )
         cell.A.copy_(cell.A * std / std[:, None])
@@ -209,7 +213,7 @@ def initialise(
             cell.Cz[: cell.nu], cell.Dzu[: cell.nu] = 0.0, torch.eye(cell.nu).to(u)[:nz]
         if integrating.all() and not z_feedthrough:
             raise InputError(
-                "z_feedthrough is False, and all states integrate, which z must not see; raise nx."
+                "z_feedthrough is False, and all states integrate, which z may not see; raise nx."
             )
         cell.Cz[:, integrating] = 0.0
         if structure == "hammerstein":
@@ -241,7 +245,7 @@ def initialise(
 
 @torch.no_grad()
 def _in_series(model: Model) -> Model:
-    """The model with a second set of its states behind the static map; w alone drives those."""
+    """The model with a copy of its states behind the static map, which w alone drives."""
     before, none, K = model.lfr.cell, torch.zeros_like, model.K
     sizes = before.nu, before.ny, 2 * before.nx, before.nz, before.nw
     like = {"device": before.A.device, "dtype": before.A.dtype}
@@ -258,23 +262,23 @@ def _in_series(model: Model) -> Model:
 
 
 def _check_structure(structure: str, nz: int, nw: int, nn: int | None) -> None:
-    """Refuse what a structure has no place for with a ValueError."""
+    """Raise a ValueError for an unknown structure, or sizes that do not fit it."""
     if structure not in held.STRUCTURES:
         raise InputError(f"structure is {structure!r}; use one of {', '.join(held.STRUCTURES)}.")
     if structure == "parallel":
         if nz != nw:
             raise InputError(
-                f"structure is 'parallel', which has a w for each z; nz is {nz} and nw is {nw}."
+                f"structure is 'parallel', which has a w for each z, but nz={nz} and nw={nw}."
             )
         if nn is not None and nn < nz:
-            raise InputError(f"structure is 'parallel', and {nn} neurons are fewer than {nz} z.")
+            raise InputError(f"structure is 'parallel', but {nn} neurons are fewer than {nz} z.")
 
 
 def _check_no_feedthrough(bla: LinearModel, structure: str, z_feedthrough: bool) -> None:
-    """Refuse what lets the input act on the output at once with a ValueError."""
+    """Raise a ValueError if the input would act on the output at once."""
     if bla.D.any():
         raise InputError(
-            "feedthrough is False, and the linear model has one; estimate it with "
+            "feedthrough is False, but the linear model has feedthrough; estimate it with "
             "estimate_bla(..., feedthrough=False)."
         )
     if structure == "wiener" and z_feedthrough:
@@ -285,7 +289,7 @@ def _check_no_feedthrough(bla: LinearModel, structure: str, z_feedthrough: bool)
 
 
 def _check_sizes(static: Module, nz: int, nw: int, dtype: torch.dtype) -> None:
-    """Refuse a static map that does not take nz to nw signals with a ValueError."""
+    """Raise a ValueError if a static map does not map nz signals to nw signals."""
     try:
         with torch.no_grad():
             found: object = tuple(static(torch.zeros(1, 2, nz, dtype=dtype)).shape)

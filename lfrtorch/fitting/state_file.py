@@ -1,7 +1,7 @@
-"""A search on disk: its numbers as JSON and its tensors in one safetensors file, no pickle.
+"""The state of a fit on disk: numbers as JSON and tensors in one safetensors file, no pickle.
 
-It is no checkpoint, which people keep: a fit replaces this file every few seconds, and only the
-same fit reads it again.
+The file is not a checkpoint to keep: a fit replaces it every few seconds, and only the same fit
+reads it again.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _FORMAT = "lfrtorch snapshot 4"
 
 
 def write(path: Path, numbers: Numbers, tensors: Tensors) -> None:
-    """Replace the file at once."""
+    """Replace the file atomically."""
     with whole_file(path) as fresh:
         write_tensors(fresh, tensors, format=_FORMAT, numbers=json.dumps(numbers))
 
@@ -35,7 +35,7 @@ def read(path: Path) -> tuple[Numbers, Tensors]:
         tensors, about = read_tensors(path)
     except OSError as error:
         raise InputError(
-            f"'{path}', where a fit stood, is damaged ({brief(error)}); start from the "
+            f"'{path}', the state of a fit, is damaged ({brief(error)}); start from the "
             "best model of the run instead: init_from=DIR."
         ) from None
     if about.get("format") != _FORMAT:
@@ -47,9 +47,10 @@ def read(path: Path) -> tuple[Numbers, Tensors]:
 
 
 def packed(value: Any, name: str = "") -> tuple[Any, Tensors]:
-    """Return a value of dataclasses, tuples, dictionaries, numbers and texts, and its tensors.
+    """Return a value as dictionaries, lists, numbers and texts, and its tensors by name.
 
-    Tensors have the names of the fields that lead to them, with dots, and are None in the value.
+    The value is made of dataclasses, tuples, dictionaries, numbers, texts and tensors. Tensors are
+    None in the first result. Their names are the names of the fields that lead to them, with dots.
     """
     if isinstance(value, Tensor):
         return None, {name: value}
@@ -68,10 +69,12 @@ def packed(value: Any, name: str = "") -> tuple[Any, Tensors]:
 
 
 def unpacked(like: Any, value: Any, tensors: Tensors, name: str = "") -> Any:
-    """Return what was packed, of the kinds that ``like`` has; of a longer tuple those of its last.
+    """Return what was packed, with the types of ``like``.
+
+    In a tuple longer than that of ``like``, further items have the type of its last item.
 
     Raises:
-        TypeError, KeyError: it was of other kinds.
+        TypeError, KeyError: the packed value had other types.
     """
     if name in tensors:
         return tensors[name]

@@ -1,4 +1,4 @@
-"""States of unit rms over the training data: the coordinates in which a fit leaves a model."""
+"""Scaling of states to unit rms over the training data, at the end of a fit."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from lfrtorch.model.model import Model, state_moment
 def scale_states(
     model: Model, records: Record | Sequence[Record], *, keep_coordinates: bool = False
 ) -> None:
-    """Give a model states of unit rms over records, in place, and note their covariance there."""
-    # The covariance is E x xᵀ about 0: an observer or a simulation that begins at x = 0 amid such
-    # data is wrong by so much. The coordinates change by a diagonal matrix. So zeros of A stay
-    # zeros, and its diagonal keeps its bits: an exact integrator stays one, and P of a proof that
-    # the model contracts becomes another P. All states stay if one of their matrices is frozen or
-    # has another entry that a fit holds, or if start states are given (``keep_coordinates``); of a
-    # model that diverges, too, and the covariance is 1.
+    """Scale a model's states to unit rms over records, in place, and store their covariance."""
+    # The covariance is E x xᵀ about 0: the error of an observer or a simulation that begins at
+    # x = 0 amid such data. The coordinates change by a diagonal matrix. So zeros of A stay zero,
+    # and the diagonal of A keeps its bits: exact integrators stay exact, and a certificate of
+    # contraction stays valid with another P. No state is scaled if one of their matrices is frozen
+    # or has another held entry, if start states are given (``keep_coordinates``), or if the model
+    # diverges. In the last case the covariance is the identity.
     cell, moment = model.lfr.cell, state_moment(model, records)
     if not torch.isfinite(moment).all():
         moment = torch.eye(cell.nx, dtype=torch.float64)
@@ -30,7 +30,7 @@ def scale_states(
     free = all(weight.requires_grad for weight in (cell.A, *into, *of)) and _scalable(cell)
     if keep_coordinates or not free:
         rms = torch.ones_like(rms)
-    rms = torch.where((rms == 0) | ((rms - 1.0).abs() < 1e-9), 1.0, rms)  # what may be rounding
+    rms = torch.where((rms == 0) | ((rms - 1.0).abs() < 1e-9), 1.0, rms)  # ignores rounding
     cell.state_covariance.copy_(moment / torch.outer(rms, rms))
     cell.A.mul_((rms / rms[:, None]).to(cell.A))
     for weight in into:
@@ -43,9 +43,10 @@ def scale_states(
 
 
 def _scalable(cell: LFRCell) -> bool:
-    """Tell if other units of the states change no entry that a fit holds.
+    """Tell if scaling the states changes no held entry.
 
-    Zeros and the diagonal of A stay. Entries between integrators change, and these stay exact.
+    Zeros and the diagonal of A never change. Held entries between integrators may change, as the
+    integrators stay exact.
     """
     own = {name: (cell.held[name], cell.get_parameter(name).detach()) for name in cell.held}
     for name, (mask, values) in {**own, **(cell.of_system or {})}.items():

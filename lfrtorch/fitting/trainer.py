@@ -1,4 +1,4 @@
-"""The one training loop: step, log, keep the best on validation, stop."""
+"""The training loop of all fits: step, log, keep the iterate that is best on validation, stop."""
 
 from __future__ import annotations
 
@@ -32,23 +32,25 @@ from lfrtorch.least_squares.shared_problem import problem_of
 from lfrtorch.model.model import Model
 
 EXPLOSION = 100.0
-"""Growth of the squared validation error, beyond the start's, in a step that is taken back."""
+"""A step is undone if it raises the squared validation error by more than this factor, and to more
+than the error at the start."""
 
 
 class StartDivergesError(InputError):
-    """All models diverge on the training records at the start."""
+    """All models diverge on the training records before the first iteration."""
 
 
 class Trainer(Protocol):
     """A search in steps: Levenberg-Marquardt or Adam.
 
-    Its states are values: ``point`` (θ and what the problem found there), ``iteration``, ``reason``
-    (empty while it goes on), and ``report``, scalars of the last step for monitors.
+    The states of a search are plain values. They have ``point`` (θ and the simulations there),
+    ``iteration``, ``reason`` (empty while the search goes on) and ``report`` (scalars of the last
+    step, for monitors).
     """
 
     @property
     def limit(self) -> int:
-        """Most iterations."""
+        """Largest number of iterations."""
         ...
 
     @property
@@ -57,7 +59,7 @@ class Trainer(Protocol):
         ...
 
     def init(self, problem: Any, theta: Tensor, point: Point | None = None) -> Any:
-        """State at the start, and what was found there if it is known."""
+        """State at the start θ; ``point`` is the evaluation there, if it is known."""
         ...
 
     def step(self, problem: Any, state: Any) -> Any:
@@ -65,22 +67,22 @@ class Trainer(Protocol):
         ...
 
     def refused(self, before: Any, after: Any) -> Any:
-        """State to go on from after a step to a model that explodes on validation."""
+        """State to go on from after a step is undone, as its model explodes on validation."""
         ...
 
     def prolonged(self, state: Any) -> Any:
-        """State to go on from if all iterations were spent and more are allowed now."""
+        """State to go on from; a search that used up its iterations goes on if the limit rises."""
         ...
 
 
 Monitor = Callable[[Model, Progress], None]
-"""Called at the start and after each iteration, the iterate in the model's weights."""
+"""Called at the start and after each iteration, with the model at this iterate."""
 
 Stop = Callable[[], bool]
-"""Asked before each iteration; True ends the fit there, and the best iterate is kept."""
+"""Called before each iteration; True ends the fit there, and the best iterate is kept."""
 
 Keep = Callable[["Fit", bool], None]
-"""Called with a fit after each iteration, and when it pauses (then with True)."""
+"""Called with a fit and False after each iteration, and with True when the fit pauses."""
 
 
 @dataclass(frozen=True)
@@ -88,11 +90,11 @@ class RestartSummary:
     """Progress of one of several starts.
 
     Args:
-        number: its place in the order given, from 0.
+        number: index of the start in the order given, from 0.
         train, validation: errors of its best iterate, output unit.
         selection: its error on all records that choose among starts; NaN if there are none.
-        reason: why it ended, a :class:`lfrtorch.Reason` or, if a process was lost, a text with the
-            detail.
+        reason: why the start ended: a :class:`lfrtorch.Reason`, or a text with the detail if a
+            process was lost.
     """
 
     number: int
@@ -109,8 +111,8 @@ class Round:
 
     Args:
         number, count: its number, from 1, and the number of all rounds.
-        starts: that took part in it, the best first.
-        seconds: since the beginning.
+        starts: the starts that took part in it, the best first.
+        seconds: time since the beginning of the fit.
     """
 
     number: int
@@ -124,18 +126,19 @@ class FitResult:
     """Outcome of a fit; the best iterate is in ``model``.
 
     Args:
-        model: the fitted model, the object that was given.
-        history: one entry an iteration, the start first.
+        model: the fitted model: the same object as the start, unless it is a mean.
+        history: one entry for each iteration, the start first.
         chosen_iteration: the iterate that ``model`` holds.
-        seconds: duration of the whole fit. If it went on from snapshots, those that its starts had
-            taken before are added.
-        seconds_per_iteration: median over the accepted iterations but the first, which may compile.
+        seconds: duration of the whole fit. If the fit went on from snapshots, the time before the
+            interruption is included.
+        seconds_per_iteration: median over the accepted iterations except the first, which may
+            include compilation.
         reason: why the search ended, a :class:`lfrtorch.Reason`.
-        detail: further remark on a lost process, or on a slope that is not finite.
+        detail: what was lost, or which slope is not finite, if ``reason`` needs it.
         starts: all starts if there were several, the best first.
-        averaged: number of starts that the model is the mean of; history and iterate are those
-            of the best one.
-        members: the models of these starts; none if it is no mean.
+        averaged: number of starts whose mean is ``model``; ``history`` and ``chosen_iteration`` are
+            those of the best start.
+        members: the models that were averaged; empty if ``model`` is not a mean.
 
     Example:
         >>> result = lfrtorch.fit(model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=3))
@@ -163,18 +166,18 @@ class FitResult:
 
     @property
     def outcome(self) -> str:
-        """The reason, with its detail, as people read it."""
+        """The reason with its detail, as a text."""
         return str(told(self.reason, self.detail))
 
 
 class StoppedError(LfrtorchError):
-    """A fit or a search was stopped before there was anything to keep."""
+    """A fit or a search was stopped before there was a model to keep."""
 
 
 class Fit:
-    """A fit that goes on for as many iterations as it is asked for, and keeps the best iterate."""
+    """A fit that advances by as many iterations as it is asked for, and keeps the best iterate."""
 
-    # Each process has its own ``stop``, and one that says so ends all.
+    # Each process has its own ``stop``; if one of them returns True, all processes end.
 
     def __init__(
         self,
@@ -201,7 +204,7 @@ class Fit:
         self.problem = problem_of(model, train, ridge=ridge, guarantee=guarantee)
         self.judge = Problem.judge(model, validation) if validation else None
         self.at: FitState | None = None
-        """Where it stands; None before the first call of ``advance``."""
+        """State of the fit; None before the first call of ``advance``."""
         self.note_end(Reason.NO_ITERATIONS)
         theta = self.problem.theta
         self._start: Point | None = self.problem.evaluate(theta)
@@ -213,27 +216,27 @@ class Fit:
 
     @property
     def state(self) -> Any:
-        """The trainer's state; None before the first call of ``advance``."""
+        """State of the trainer; None before the first call of ``advance``."""
         return None if self.at is None else self.at.search
 
     @property
     def history(self) -> tuple[Progress, ...]:
-        """One entry an iterate, the start first; none before the first call of ``advance``."""
+        """One entry for each iterate, the start first; empty before the first ``advance``."""
         return () if self.at is None else self.at.history
 
     @property
     def best(self) -> float:
-        """Normalised squared error of the best iterate, on validation if there is one."""
+        """Normalised squared error of the best iterate, on validation records if there are any."""
         return math.inf if self.at is None else self.at.kept.score
 
     @property
     def seconds(self) -> float:
-        """Time of all iterations, those before it went on included."""
+        """Time of all iterations, including those before an interruption."""
         return 0.0 if self.at is None else self.at.history[-1].seconds
 
     @property
     def diverges(self) -> bool:
-        """True if the model diverges on the training records at the start."""
+        """True if the model diverges on the training records before the first iteration."""
         return self.reason == Reason.START_DIVERGES
 
     @property
@@ -250,7 +253,7 @@ class Fit:
         return bool(self.state.reason) or self.state.iteration >= self.trainer.limit
 
     def short_of(self, until: int) -> bool:
-        """Return whether it goes on to an iteration, and is not asked to stop."""
+        """Tell if the fit has not reached an iteration, has not ended and is not asked to stop."""
         return not self.over and self.state.iteration < until and not self.stopped()
 
     def note_end(self, reason: str, detail: str = "") -> None:
@@ -258,7 +261,7 @@ class Fit:
         self.reason, self.detail = reason, detail
 
     def stopped(self) -> bool:
-        """Tell if the fit is asked to end here, which then is its reason."""
+        """Tell if the fit is asked to end here; if so, note that as the reason."""
         asked = self._stop is not None and bool(self.problem.total(torch.tensor(int(self._stop()))))
         if asked:
             self.note_end(Reason.INTERRUPTED)
@@ -266,7 +269,7 @@ class Fit:
 
     @spread_by_hand()
     def advance(self, until: int | None = None, monitors: Sequence[Monitor] = ()) -> Self:
-        """Go on to an iteration (default: the trainer's last); the best is in the model."""
+        """Go on to an iteration (default: the trainer's last); the model keeps the best iterate."""
         until = self.trainer.limit if until is None else until
         try:
             if not self.history:
@@ -288,14 +291,14 @@ class Fit:
         return self
 
     def pause(self) -> None:
-        """Put the best iterate into the model, and let go of memory."""
+        """Put the best iterate into the model, and free memory."""
         self._write_best()
         self.problem.release()
         if not self.diverges:
             self.keep(self, True)
 
     def save(self, path: Path) -> None:
-        """Write the state of the fit to a file, from which ``restore`` goes on to the same bits."""
+        """Write the state to a file; after ``restore`` the fit goes on to bit-identical results."""
         whole = {"at": self.at, "problem": self.problem.state_dict()}
         state_file.write(path, *state_file.packed(whole))
 
@@ -308,24 +311,24 @@ class Fit:
             whole = state_file.unpacked(like, found, tensors)
         except (TypeError, KeyError):
             raise InputError(
-                f"'{path}' was left by another trainer than {type(self.trainer).__name__}; go "
-                "on with the one that the run had."
+                f"'{path}' was written with another trainer than {type(self.trainer).__name__}; "
+                "continue with the trainer of the interrupted run."
             ) from None
         self.problem.load_state_dict(whole["problem"])
         at: FitState = whole["at"]
         state = at.search
         if state.iteration > self.trainer.limit:
             raise InputError(
-                f"the fit that is to go on has had {state.iteration} iterations, more than the "
-                f"{self.trainer.limit} asked for; ask for more."
+                f"the fit that is continued has had {state.iteration} iterations, more than "
+                f"max_iter, which is {self.trainer.limit}; give a larger max_iter."
             )
-        state = self.problem.of_own_records(state)  # what was kept is the first process's part
+        state = self.problem.of_own_records(state)  # the file is of the first process's records
         self.at = replace(at, search=self.trainer.prolonged(state))
         self.reason = self.state.reason
         self._write_best()
 
     def begin(self, monitors: Sequence[Monitor] = ()) -> None:
-        """Judge the start."""
+        """Evaluate the start, and call the monitors."""
         self.at = self._begun()
         self._show(self.state.theta, self.at.history[0], monitors)
 
@@ -333,7 +336,7 @@ class Fit:
         """State at the start."""
         clock = time.perf_counter()
         start = Search(self.problem, self.trainer).begin(self.problem.theta, self._start)
-        self._start = None  # its trajectories are the state's now
+        self._start = None  # the state holds its trajectories now
         at = FitState(start, (), start.theta, ())
         return self._entered(at, start, time.perf_counter() - clock)
 
@@ -352,7 +355,7 @@ class Fit:
         self.keep(self, False)
 
     def show_last(self, monitors: Sequence[Monitor]) -> None:
-        """Call monitors with the latest iterate; the best is in the model again after that."""
+        """Call monitors with the latest iterate; afterwards the model is the best iterate again."""
         self._show(self.state.theta, self.history[-1], monitors)
         self._write_best()
 
@@ -376,10 +379,10 @@ class Fit:
         train_rmse, validation_rmse = problem.rmse_at(search.point), float("nan")
         score, judged = search.point.cost, ()
         if self.judge is not None:
-            theta = search.theta[: problem.errors.parameters.own]  # the judge finds initial states
+            theta = search.theta[: problem.errors.parameters.own]  # the judge fits start states
             near = Point(theta, theta, 0.0, at.judged) if at.judged else None
             point = self.judge.evaluate(theta, near)  # every output counts alike
-            # Each process has all of these records, and its own rounding errors.
+            # All processes simulate all of these records, but their rounding errors differ.
             score = float(self.problem.agreed(torch.tensor(point.cost, dtype=torch.float64)))
             validation_rmse, judged = self.judge.rmse_at(point), point.seen
         better = score < (at.kept.score if at.history else math.inf)  # False for NaN
@@ -395,7 +398,7 @@ class Fit:
         self.problem.write(self.problem.theta if self.at is None else self.at.best)
 
     def _show(self, theta: Tensor, progress: Progress, monitors: Sequence[Monitor]) -> None:
-        """Call the monitors, with the iterate in the model."""
+        """Call the monitors, with the weights of this iterate in the model."""
         if monitors:
             self.problem.write(theta)
         for monitor in monitors:

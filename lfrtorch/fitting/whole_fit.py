@@ -1,4 +1,4 @@
-"""The fit of an identification: all starts, to all training records."""
+"""The main fit of an identification: all starts are fitted to all training records."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import replace
 from lfrtorch.fitting.stage import Data, Job, Stage
 
 SLOW_SAMPLES = 5000
-"""Training samples from which a static map that is not compiled is worth a note."""
+"""Number of training samples from which a note warns of a static map that is not compiled."""
 
 
 class WholeFit(Stage):
-    """The fit that is scored; one that was cut short is kept as it is."""
+    """The fit that is scored; its result is kept also if it was cut short."""
 
     def run(self, job: Job) -> Job:
         """The job with its result."""
@@ -20,7 +20,7 @@ class WholeFit(Stage):
         if samples >= SLOW_SAMPLES and models[0].lfr.cell.map.code is None:
             observer.say(
                 "note: the static map is a module of your own, which is not compiled: an iteration "
-                "takes some ten times as long as with a network or a polynomial"
+                "takes about ten times as long as with a network or a polynomial"
             )
         observer.say(
             f"{dataset.name}: {samples} training samples, "

@@ -1,31 +1,32 @@
 """Fits over a horizon: records are cut into windows, and each window is simulated by itself.
 
-A simulation error of a whole record asks the model for the right output after thousands of samples.
-Far from the minimum it has many poor ones, and where small changes of θ grow along a trajectory
-(unstable transients, chaos) it is no smooth function of θ (Ribeiro et al., 2020). Over windows of
-h samples changes grow for h samples at most, and the error is still one of a simulation.
+The simulation error of a whole record compares outputs even after thousands of samples. Far from
+its minimum this error has many poor local minima. Where small changes of θ grow along a trajectory
+(unstable transients, chaos), it is not a smooth function of θ (Ribeiro et al., 2020). Over windows
+of h samples, changes grow for at most h samples, and the error is still a simulation error.
 
-Each window begins in a state of its own that is fitted with the parameters, as that of a record
-with an estimated start is: multiple shooting without constraints. White noise on the outputs
-puts nx ny errors of each window into its state, for all parameters, so that windows of a
-linear model have the minimum of whole records but for chance. The alternative, a state from the
-one-step predictor of an innovation form (the error of predictions 1 to h samples ahead), needs the
-gain K, which the data do not tell while the model is poor, and does not exist for models with exact
-integrators; and it still depends on θ through all samples before the window. As start states are
-eliminated (``lfrtorch.least_squares.start_states``), theirs are no parameters of a step's system.
-No constraint joins a window to the next one.
+Each window begins in its own state, which is fitted with the parameters, as for a record with an
+estimated start: multiple shooting without constraints between windows. The fitted state absorbs
+white output noise in nx directions of each window's errors, whatever the parameters. So windows of
+a linear model have the same minimum as whole records, apart from chance. The alternative is a state
+from the one-step predictor of an innovation form, for predictions 1 to h samples ahead. It needs
+the gain K, which the data do not determine while the model is poor, and which models with exact
+integrators do not have. That state also depends on θ through all samples before the window. The
+start states of windows are eliminated (``lfrtorch.least_squares.start_states``), so they do not
+enlarge the linear system of a step.
 
-Where outputs tell the states (``start="measured"``) a window begins at an output, with nothing to
-estimate: the error over it is that of predictions 1 to h samples ahead. It is weighed by that of
-holding the output, in each record: errors that grow fast, as those of rates do, would hide the
-others. Outputs of one unit have one weight. Errors are about as large as what moves, so windows
-weigh by the inverse of that, and their squares count as absolute values do: otherwise the few in
-which a manoeuvre ends badly would decide.
+If ``start="measured"``, outputs determine the states, and a window begins at an output, with no
+state to estimate: its errors are those of predictions 1 to h samples ahead. In each record, errors
+are divided by the error of holding the output. Otherwise errors that grow fast, as those of rates
+do, would hide the others. Outputs of the same unit have the same weight. Errors of a window are
+about proportional to its motion. So a window is weighted by the inverse of its rms motion, and its
+squared errors count like absolute values. Otherwise the few windows in which a manoeuvre ends badly
+would decide the fit.
 
-Windows of the validation records choose the iterate, each simulated from a state that is fitted to
-samples before it, so that no error is of a sample that its state was fitted to. A whole simulation
-is a poor judge of a model on its way: where small changes grow, it is wrong after some time even if
-the model is nearly right.
+Windows of the validation records choose the iterate. Each window is simulated from a state fitted
+to samples before it, so no scored sample has determined its state. Whole simulations do not rank
+unfinished models well: where small changes grow, even a nearly right model is wrong after some
+time.
 
 References:
     Bock, "Numerical treatment of inverse problems in chemical reaction kinetics", in Modelling of
@@ -48,14 +49,15 @@ from lfrtorch._support.types import Array
 from lfrtorch.data.records import Record
 
 BEFORE = 20
-"""Outputs for each state before a window of validation. For good models of the wells in
-``benchmarks/horizon.py``, with two states, 40 samples told the start of 81 of 81 windows, 50 of 78,
-and 100 of 61 of 84: where small changes grow, the error over more samples has many minima."""
+"""Number of outputs per state that determine the start of a validation window. Good models of the
+wells in ``benchmarks/horizon.py`` have two states. There 40 samples determine the start of 81 of 81
+windows, 50 samples that of 78, and 100 samples that of 61 of 84. Where small changes grow, the
+error over more samples has many minima."""
 
 
 _STILL = 0.1
-"""Squared motion of a window, relative to its record's, that adds to its own: one at rest is no
-better than others."""
+"""Squared motion, relative to that of holding the output, that is added to each window's own. It
+bounds the weight of windows at rest."""
 
 
 def windows(
@@ -66,12 +68,13 @@ def windows(
     fitted: bool = True,
     y_scale: Array | None = None,
 ) -> list[Record]:
-    """The samples that a fit scores, in windows of ``horizon`` samples."""
-    # Windows of a record are spread evenly and overlap as little as they can; their samples have
-    # the weight of the record's together. The first one begins as the record does, with what is
-    # skipped, and all others in states to be estimated: parameters of a fit, or else estimated from
-    # skipped samples before the window, ``BEFORE`` for each state or, if these are more, as many as
-    # the record skips. A window that has fewer begins as the record does.
+    """Cut the scored samples of records into windows of ``horizon`` samples."""
+    # Windows of a record are spread evenly and overlap as little as possible; together their
+    # samples have the weight of the record's samples. The first window begins as the record does,
+    # with its skipped samples. All others begin in estimated states. If ``fitted``, these states
+    # are parameters of the fit. Otherwise they are estimated from skipped samples before the
+    # window: ``BEFORE`` outputs for each state, or as many samples as the record skips, if these
+    # are more. A window with fewer samples before it begins as the record does.
     integer("horizon", horizon, 2)
     found = []
     for record in records:
@@ -88,8 +91,8 @@ def windows(
             )
         if record.line_weight is not None:
             raise InputError(
-                f"record '{record.name}' has line_weight, and windows have other lines; give "
-                "horizon=None, or records without it."
+                f"record '{record.name}' has line_weight, which does not fit the frequency lines "
+                "of windows; give horizon=None, or records without it."
             )
         before = max(math.ceil(BEFORE * nx / record.y.shape[1]), record.skip)
         found += _windows(record, horizon, 0 if fitted else before)
@@ -97,18 +100,18 @@ def windows(
 
 
 def begins_at_outputs(records: Sequence[Record]) -> bool:
-    """Tell if all records have measured starts; a ValueError if some have."""
+    """Tell if all records have measured starts; raise a ValueError if only some have."""
     measured = {record.start == "measured" for record in records}
     if len(measured) > 1:
         raise InputError(
-            "some records have start 'measured' and others not; give all the same, as the model's "
-            "states are then its outputs."
+            "some records have start 'measured' and others not; give all records this start or "
+            "none: with it the model's states are its outputs."
         )
     return measured == {True}
 
 
 def in_windows(records: Sequence[Record], horizon: int | None) -> Sequence[Record]:
-    """Training records as a fit simulates them: in windows if they begin at outputs, else whole."""
+    """Training records, cut into windows if a horizon is given and they have measured starts."""
     if horizon is None or any(record.start != "measured" for record in records):
         return records
     return windows(records, horizon, records[0].y.shape[1])
@@ -117,7 +120,7 @@ def in_windows(records: Sequence[Record], horizon: int | None) -> Sequence[Recor
 def windows_from_outputs(
     record: Record, horizon: int, apart: int, y_scale: Array | None
 ) -> list[Record]:
-    """Windows that begin at measured outputs, with the weight of the record's samples together."""
+    """Windows that begin at measured outputs; together they weigh as much as the record."""
     record.require_all_valid("a fit from measured outputs")
     last = max(record.samples - 1 - horizon, 0)
     begins = np.linspace(0, last, 1 + math.ceil(last / apart)).round().astype(int)
@@ -135,7 +138,7 @@ def windows_from_outputs(
 
 
 def _held(record: Record, horizon: int) -> Array:
-    """Rms error of holding each output over a horizon, together with those of its unit."""
+    """Rms error of holding each output over a horizon, pooled over outputs of the same unit."""
     ahead = range(1, min(horizon, record.samples - 1) + 1)
     squares = np.mean([((record.y[h:] - record.y[:-h]) ** 2).mean(axis=0) for h in ahead], axis=0)
     units = np.array([channel.unit or channel.name for channel in record.outputs])
@@ -144,7 +147,7 @@ def _held(record: Record, horizon: int) -> Array:
 
 
 def _windows(record: Record, horizon: int, before: int) -> list[Record]:
-    """Those of one record that is longer, with samples before them."""
+    """Windows of one record that is longer than a window, with samples before them."""
     scored = record.samples - record.skip
     count = math.ceil(scored / horizon)
     weight = np.asarray(record.weight) * scored / (count * horizon)
@@ -152,13 +155,13 @@ def _windows(record: Record, horizon: int, before: int) -> list[Record]:
     for b in record.skip + np.linspace(0, scored - horizon, count).round().astype(int):
         needed = np.split(record.is_valid[max(b - before, 0) : b + horizon], [min(before, b)])
         if not all(part.any(axis=0).all() for part in needed if len(part)):
-            continue  # a hole, where an output tells nothing of the window or of its start
+            continue  # an output has no valid sample in the window, or before it
         if record.start != "periodic" and b <= max(before, record.skip):
             first = record.part(
                 slice(b + horizon), start=record.start, skip=b, period=None, weight=weight
             )
             found.append(first)
-        else:  # in steady state what is before the first sample are the last ones
+        else:  # in steady state the last samples precede the first one
             cut = np.arange(b - before, b + horizon)
             amid = record.part(
                 cut, start="estimated", x0=None, skip=before, period=None, weight=weight
@@ -166,7 +169,7 @@ def _windows(record: Record, horizon: int, before: int) -> list[Record]:
             found.append(amid)
     if not found:
         raise InputError(
-            f"record '{record.name}' has no window of {horizon} samples with a valid one of each "
-            "output; give a longer horizon, or horizon=None."
+            f"record '{record.name}' has no window of {horizon} samples with a valid sample of "
+            "each output; give a longer horizon, or horizon=None."
         )
     return found

@@ -261,10 +261,10 @@ def test_outputs_that_are_fitted_tell_no_states(flights: Dataset) -> None:
     linear = measured_states_model(flights.train)
     cut = windows(flights.train, HORIZON, 2)
     model = lfrtorch.initialise(linear, cut, nz=1, nw=1, nn=2)
-    with pytest.raises(InputError, match="start='measured' takes the states from the output"):
+    with pytest.raises(InputError, match="start='measured' computes states from outputs"):
         lfrtorch.fit(model, flights.train)
     scaled = known(outputs=lambda x, u, p: (p.gain * x.angle, x.speed))
-    with pytest.raises(InputError, match="start='measured' takes the states from the output"):
+    with pytest.raises(InputError, match="start='measured' computes states from outputs"):
         lfrtorch.identify(flights, Settings(known=scaled, horizon=HORIZON))
 
 
