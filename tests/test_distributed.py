@@ -368,7 +368,7 @@ def test_as_many_starts_as_processes_are_shared_and_else_the_records(starts: int
 
 def test_more_processes_than_records(both: list[dict[str, Any]]):
     for found in both:
-        assert "2 processes share 1 record(s); each needs one: start fewer" in found["refusal"]
+        assert "share 1 record(s), but each needs one; start fewer" in found["refusal"]
 
 
 def test_outside_torchrun_a_process_is_alone(monkeypatch: pytest.MonkeyPatch):

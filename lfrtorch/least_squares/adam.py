@@ -1,6 +1,7 @@
-"""Adam, a baseline for Levenberg-Marquardt: on minibatches of many records, or on all of a few.
+"""Adam, a baseline for Levenberg-Marquardt, on minibatches of records or on all records at once.
 
-Records are many where a fit is over windows. An epoch then has a step for each minibatch of them.
+There are many records if a fit is over windows. An epoch then has one step for each minibatch;
+with few records it has a single step.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class Differentiable(Protocol):
     def gradient(
         self, theta: Float[Tensor, " P"], near: Point | None = None
     ) -> tuple[Point, Float[Tensor, " P"]]:
-        """r at θ and the gradient of its mean square; ``near`` is a point close by."""
+        """r at θ and the gradient of its mean square; ``near`` is a nearby point."""
         ...
 
     def evaluate(self, theta: Float[Tensor, " P"], near: Point | None = None) -> Point:
@@ -34,22 +35,22 @@ class Differentiable(Protocol):
         return self.gradient(theta, near)[0]
 
     def minibatches(self, epoch: int) -> Sequence[Differentiable]:
-        """Parts of the data, another division of it in each epoch; this if it is not divided."""
+        """Problems on parts of the data, divided anew in each epoch; the problem itself if not."""
         return [self]
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
-        """θ, or one near it that the search may go to."""
+        """θ, or the nearby θ that the search may use in its place."""
         return theta
 
 
 @dataclass
 class AdamState:
-    """Where the search stands: θ, r(θ), the optimiser's moments, and why it ended."""
+    """State of the search: θ, r(θ), the optimiser's moments, and why the search ended."""
 
     theta: Float[Tensor, " P"]
     residual: Float[Tensor, " M"]
     cost: float
-    seen: tuple[Any, ...]  # of ``Point``
+    seen: tuple[Any, ...]  # see ``Point``
     gradient: Float[Tensor, " P"]
     iteration: int = 0
     reason: str = ""
@@ -57,7 +58,7 @@ class AdamState:
 
     @property
     def point(self) -> Point:
-        """θ and what was found there."""
+        """The evaluation at θ."""
         return Point(self.theta, self.residual, self.cost, self.seen)
 
     @property
@@ -81,11 +82,11 @@ class Adam(AdamOptions):
 
     @property
     def limit(self) -> int:
-        """Most iterations."""
+        """Largest number of epochs."""
         return self.max_iter
 
     def init(self, problem: Differentiable, theta: Tensor, point: Point | None = None) -> AdamState:
-        """State at the first θ, and what was found there if it is known."""
+        """State at the first θ; ``point`` is the evaluation there, if it is known."""
         found, gradient = problem.gradient(theta, point)
         return AdamState(*found, gradient)
 
@@ -116,10 +117,10 @@ class Adam(AdamOptions):
         return AdamState(*point, gradient, iteration, reason, moments)
 
     def prolonged(self, state: AdamState) -> AdamState:
-        """State to go on from if all epochs were spent and there are more now."""
+        """State to go on from; a search that used up its epochs goes on if the limit rises."""
         spent = state.reason == Reason.ALL_EPOCHS and state.iteration < self.max_iter
         return replace(state, reason="") if spent else state
 
     def refused(self, before: AdamState, after: AdamState) -> AdamState:
-        """State to go on from after a poor step: it stays, since small steps lead out again."""
+        """State to go on from after a poor step: the step is kept, as small steps can undo it."""
         return after

@@ -1,4 +1,4 @@
-"""Steps of a search within bounds that hold to first order, tightened until they hold."""
+"""Steps of a search within bounds: linear bounds, tightened until the exact bounds hold."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from torch import Tensor
 from lfrtorch.least_squares.linear_systems import System
 
 ROUNDING = 1e-12
-"""A step at a bound is not beyond it."""
+"""Relative excess over a bound that counts as rounding."""
 
 
 class Bounds(Protocol):
     """Bounds C δ <= room of a step δ, to first order."""
 
     slopes: Float[Tensor, "bounds own"]
-    """C, for the first entries of a step; the others are 0."""
+    """C for the first entries of a step; its columns for further entries are 0."""
 
     room: Float[Tensor, " bounds"]
-    """Limits of a step."""
+    """Upper limits of C δ."""
 
     trusted: bool
-    """Tell if a free step within the bounds is taken unchanged."""
+    """True if an unconstrained step within the linear bounds is taken without a further check."""
 
     corrections: int
-    """Most rounds in which they are tightened."""
+    """Largest number of times that the bounds are tightened."""
 
     def tightened(
         self, step: Float[Tensor, " P"], room: Float[Tensor, " bounds"]
     ) -> Float[Tensor, " bounds"] | None:
-        """The room to try next if the step passes the bounds by higher orders; else None."""
-        # It is -inf if a step must be shorter before that can be told.
+        """The room to try next if the step passes the exact bounds; otherwise None."""
+        # The room is -inf if only a shorter step can be checked.
         ...
 
 
 class BoundedSystem:
-    """A system whose steps keep bounds."""
+    """A least-squares system whose steps stay within bounds."""
 
-    # A step beyond them is replaced by the minimum of |r + J δ|² + λ|δ|² under C δ <= room, which
-    # is tightened until the step keeps the bounds to all orders.
+    # A step beyond the bounds is replaced by the minimum of |r + J δ|² + λ|δ|² under C δ <= room.
+    # ``room`` is tightened until the step keeps the exact bounds.
 
     def __init__(self, system: System, bounds: Bounds) -> None:
         self._system, self.size, self.rank = system, system.size, system.rank
@@ -63,7 +63,7 @@ class BoundedSystem:
         if not torch.isfinite(free).all() or (within and self.bounds.trusted):
             return free
         across = torch.stack([-self._system.solve(c, damping) for c in C])
-        # Multipliers μ >= 0 of the bounds: the least |Lᵀμ - L⁻¹ excess|² for L Lᵀ = C across.
+        # Multipliers μ >= 0 of the bounds minimise |Lᵀμ - L⁻¹ excess|², with L Lᵀ = C across.
         G = C @ across.mT
         G.diagonal().add_(ROUNDING * G.diagonal().max() + torch.finfo(G.dtype).tiny)
         L = torch.linalg.cholesky(G)
@@ -76,6 +76,6 @@ class BoundedSystem:
             if tighter is None:
                 break
             if not torch.isfinite(tighter).all():
-                return torch.full_like(free, torch.nan)  # refused; the next damping is larger
+                return torch.full_like(free, torch.nan)  # refused; the search raises the damping
             room = tighter
         return step

@@ -1,4 +1,4 @@
-"""Bounds of single parameters: steps that end at them, and a θ that is put back within them."""
+"""Bounds of single parameters: steps end at the bounds, and θ is clipped to them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lfrtorch.least_squares.linear_systems import System
 
 
 def bounds_of(cell: LFRCell) -> Float[Tensor, "free 2"]:
-    """Least and largest value of each free parameter of a cell; infinite where there is none."""
+    """Lower and upper bound of each free parameter of a cell; infinite without a bound."""
     sizes = [(name, p.numel(), p.requires_grad) for name, p in cell.named_parameters()]
     of_map, at, free = cell.map.weight_bounds, 0, [cell.A.new_zeros(0, 2)]
     for name, count, is_free in sizes:
@@ -24,18 +24,18 @@ def bounds_of(cell: LFRCell) -> Float[Tensor, "free 2"]:
 
 
 class Box:
-    """A guarantee: parameters within bounds."""
+    """The guarantee that parameters stay within bounds."""
 
     def __init__(self, bounds: Float[Tensor, "free 2"]) -> None:
         self._low, self._high = bounds.unbind(-1)
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
-        """θ with each parameter at the nearest value within its bounds."""
+        """θ with each parameter clipped to its bounds."""
         own = theta[: len(self._low)].clamp(self._low, self._high)
         return torch.cat([own, theta[len(own) :]])
 
     def bounded(self, theta: Float[Tensor, " P"], system: System) -> System:
-        """The system whose steps end at the nearer bound of each parameter."""
+        """The system whose steps do not pass the nearer bound of each parameter."""
         return BoundedSystem(system, _Nearest(theta[: len(self._low)], self._low, self._high))
 
 
@@ -55,5 +55,5 @@ class _Nearest:
     def tightened(
         self, step: Float[Tensor, " P"], room: Float[Tensor, " near"]
     ) -> Float[Tensor, " near"] | None:
-        """None: the bounds are linear."""
+        """None, as the bounds are linear."""
         return None

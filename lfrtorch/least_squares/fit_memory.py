@@ -1,4 +1,4 @@
-"""Memory that a fit takes, from the sizes of a model."""
+"""Memory that a fit needs, computed from the sizes of a model."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ from lfrtorch._support.memory import check_memory
 from lfrtorch.engine.cell import LFRCell
 
 SQUARES = 4
-"""Matrices of P x P that a step holds at once: JᵀJ, its columns, damped, its factor."""
+"""Number of P x P matrices that a step holds at once: JᵀJ, its columns, JᵀJ + λI and its factor."""
 
 TALL = 3
-"""Matrices of P x gauge directions that a step holds at once."""
+"""Number of matrices of P x gauge directions that a step holds at once."""
 
 
 def check_fit_memory(cell: LFRCell, states: int = 0, rows: int = 0) -> None:
-    """Refuse a model whose fit takes more memory than its device has with a ValueError."""
-    # ``states`` counts all entries of estimated start states; ``rows`` the errors of records with
-    # ``line_weight``, whose rows are all held. Weights may be on torch's ``meta`` device.
+    """Raise a ValueError if the fit of a model needs more memory than its device has."""
+    # ``states`` is the number of entries of estimated start states. ``rows`` is the number of
+    # errors of records with ``line_weight``, whose Jacobian rows are all held at once. Weights may
+    # be on torch's ``meta`` device.
     P = sum(p.numel() for p in cell.parameters() if p.requires_grad) + states
-    squares = [n**2 for n in (cell.nx, cell.nz, cell.nw)]  # coordinates of x, z and w
+    squares = [n**2 for n in (cell.nx, cell.nz, cell.nw)]  # gauge directions of x, z and w
     numbers = SQUARES * P**2 + TALL * P * sum(squares) + max(squares) ** 2 + rows * P
     check_memory(
         numbers * cell.A.element_size(),

@@ -1,4 +1,4 @@
-"""Columns of the Jacobian that gauge directions leave: the others follow from them.
+"""Columns of the Jacobian that must be computed: gauge directions give the other columns.
 
 Directions G in θ that change no output (``engine.gauge_directions``) have J G = 0: some columns of
 J are combinations of others. Those columns need not be computed. The columns ``kept`` give
@@ -40,7 +40,7 @@ class Reduction(NamedTuple):
     """None if all columns are kept."""
 
     def columns(self, own: Float[Tensor, "M K"]) -> Float[Tensor, "M P"]:
-        """All columns from the kept ones: own @ expand, most of which is the identity."""
+        """All columns, from the kept columns: own @ expand, where expand is mostly the identity."""
         if self.expand is None:
             return own
         whole = own.new_empty(len(own), self.expand.shape[1])
@@ -51,11 +51,11 @@ class Reduction(NamedTuple):
         return whole
 
     def reduced(self, d_theta: Tensor) -> Tensor:
-        """A change of the kept parameters alone that has the same outputs."""
+        """A change of the kept parameters alone that changes the outputs in the same way."""
         return d_theta if self.expand is None else self.expand @ d_theta
 
     def gradient(self, own: Float[Tensor, " K"]) -> Float[Tensor, " P"]:
-        """A gradient from that in the kept columns."""
+        """The gradient by all parameters, from the gradient by the kept parameters."""
         return own if self.expand is None else self.expand.mT @ own
 
 
@@ -68,10 +68,11 @@ def reduction(
     before: Reduction | None = None,
     fixed: Bool[Tensor, " free"] | None = None,
 ) -> Reduction:
-    """Columns of the Jacobian of the free parameters to compute."""
-    # Those of ``initial_states`` come last and are kept. ``coordinates``: no initial state is given
-    # in those of x. ``before``: the reduction at weights close by, whose columns are kept if they
-    # still do. ``fixed`` entries of the free parameters have columns of zeros.
+    """The columns of the free parameters' Jacobian that must be computed."""
+    # Columns of ``initial_states`` come last and are kept. ``coordinates`` is False if an initial
+    # state is given, which fixes the coordinates of x. ``before`` is the reduction at nearby
+    # weights; its columns are used again if they are still well conditioned. ``fixed`` entries of
+    # the free parameters have columns of zeros.
     W = model.weights()
     layout, states = W.layout, initial_states.numel()
     G = gauge_directions(W, initial_states)[:, 0 if coordinates else W.nx**2 :]
@@ -84,7 +85,7 @@ def reduction(
         return _placed(everything(len(places)), places, P, like)
     own = free[places]
     if len(own) < len(G):
-        # Directions that move no fixed parameter: combinations N of G with G[fixed] N = 0.
+        # Directions that move no fixed parameter are combinations G N with G[fixed] N = 0.
         others = np.delete(G, own, axis=0)
         G = G[own] @ scipy.linalg.null_space(others) if G.shape[1] else G[own]
     elif before is not None and len(before.kept) + G.shape[1] == len(G):
@@ -92,7 +93,7 @@ def reduction(
         found = _expanded(G, left_out, like)
         if found is not None:
             return found
-    # Only columns of the linear part are left out: those of the static map are computed together.
+    # Only columns of the linear part are left out: columns of the static map are computed together.
     lti = int((own < layout.phi.start).sum())
     direct = layout.table[0, own[:lti]] == 2
     pick = np.where(direct, RELUCTANT, 1.0)[:, None] * G[:lti]
@@ -107,7 +108,7 @@ def reduction(
 
 
 def _placed(found: Reduction, places: Int[Integers, " n"], P: int, like: Tensor) -> Reduction:
-    """A reduction of the columns at some places as one of all P; the others are zeros."""
+    """A reduction of some of the P columns as a reduction of all P; the other columns are zeros."""
     if len(places) == P:
         return found
     kept, at = found.kept, torch.from_numpy(places)
@@ -119,7 +120,7 @@ def _placed(found: Reduction, places: Int[Integers, " n"], P: int, like: Tensor)
 def _expanded(
     G: Float[Array, "P directions"], left_out: Int[Integers, " n"], like: Tensor
 ) -> Reduction | None:
-    """The reduction without those columns; None if it would blow up rounding errors."""
+    """The reduction without the columns ``left_out``; None if it would amplify rounding errors."""
     kept = np.delete(np.arange(len(G)), left_out)
     expand = np.zeros((len(kept), len(G)))
     expand[np.arange(len(kept)), kept] = 1.0
@@ -134,5 +135,5 @@ def _expanded(
 
 @lru_cache(maxsize=64)
 def everything(count: int) -> Reduction:
-    """The reduction that keeps all of so many columns."""
+    """The reduction that keeps all of ``count`` columns."""
     return Reduction(torch.arange(count), None)

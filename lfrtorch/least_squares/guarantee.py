@@ -1,4 +1,4 @@
-"""Guarantees of every model of a search: a stable linear part, or contraction."""
+"""Guarantees that every model of a search keeps: a stable linear part, or contraction."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from lfrtorch.least_squares.options import check_guarantee
 from lfrtorch.least_squares.stable_states import Stable
 
 Name = Literal["stable", "contracting"] | float
-"""``"stable"``: A's eigenvalues stay within the unit circle. ``"contracting"``: every model is
-proven to contract, and a number to contract by that rate."""
+"""``"stable"``: the eigenvalues of A stay within the unit circle. ``"contracting"``: every model is
+proven to contract. A number: every model is proven to contract at this rate."""
 
 
 class Guarantee(Protocol):
-    """A guarantee, of which a search asks two things."""
+    """A guarantee, with the two methods that a search calls."""
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
-        """θ, or one near it that keeps the guarantee."""
+        """θ, or a nearby θ that keeps the guarantee."""
         ...
 
     def bounded(self, theta: Float[Tensor, " P"], system: System) -> System:
-        """The system at θ, whose steps keep the guarantee, to first order at least."""
+        """The system at θ whose steps keep the guarantee, at least to first order."""
         ...
 
 
 def guarantee_of(name: Name | None, samples: int, cell: LFRCell) -> Guarantee | None:
-    """The guarantee of a name; None if there is none, or nothing that could break it."""
-    # ``samples``: of the longest record before they were cut into windows.
+    """The guarantee of a name; None without a name, or if no free parameter could break it."""
+    # ``samples`` is the length of the longest record, before records are cut into windows.
     if isinstance(name, float):
         check_guarantee(name)
     if name == "contracting" or isinstance(name, float):

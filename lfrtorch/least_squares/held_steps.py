@@ -1,9 +1,9 @@
-"""Steps that leave what a fit holds: a projection of directions of θ, and the way back of a θ.
+"""Steps that keep held entries: steps are projected, and θ is corrected afterwards.
 
-An entry that is held is an entry of θ that does not move. A predictor has another kind as well: its
-A - K C, Bu - K Dyu and Bw - K Dyw change with K, so an entry a of the system's A, Bu or Bw is an
-equation c(θ) = a, linear in each factor. Steps move along its tangent, {d: ∂c/∂θ d = 0}; a θ is put
-back by the entries of A - K C, Bu - K Dyu and Bw - K Dyw themselves.
+A held entry is usually an entry of θ that does not change. A predictor also has held equations: its
+matrices are A - K C, Bu - K Dyu and Bw - K Dyw. So a held entry a of the system's A, Bu or Bw is an
+equation c(θ) = a, which is linear in each factor. Steps are tangent to it, {d: ∂c/∂θ d = 0}. Then
+the entries of A - K C, Bu - K Dyu and Bw - K Dyw are corrected so that the equation holds exactly.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lfrtorch.least_squares.simulation_errors import Parameters
 
 
 class Projection:
-    """The directions that leave what is held, at one θ."""
+    """Projection onto the directions that keep held entries, at one θ."""
 
     def __init__(
         self, entries: Bool[Tensor, " P"], normals: Float[Tensor, "P n"] | None = None
@@ -31,7 +31,7 @@ class Projection:
 
     @property
     def held(self) -> bool:
-        """True if anything is held."""
+        """True if an entry or an equation is held."""
         return self._any or self.tied
 
     @property
@@ -50,7 +50,7 @@ class Projection:
 
 
 class ProjectedSystem:
-    """A system whose steps leave what is held, whatever they are the answer to."""
+    """A system whose steps keep held entries."""
 
     def __init__(self, system: System, project: Projection) -> None:
         self._system, self._project = system, project
@@ -84,7 +84,7 @@ class HeldSteps:
         self._tied: Held = cell.of_system or {}
 
     def projection(self, theta: Float[Tensor, " P"]) -> Projection:
-        """The directions that are left at θ."""
+        """The projection onto the directions that are free at θ."""
         if not self._tied:
             return self._entries_alone
         W, nu = self._parameters.weights(theta), self._nu
@@ -104,7 +104,7 @@ class HeldSteps:
         return Projection(self.entries, normals.masked_fill(self.entries[:, None], 0.0))
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
-        """θ with the equations of a predictor."""
+        """θ, corrected so that the held equations of a predictor hold."""
         if not self._tied or not torch.isfinite(theta).all():
             return theta
         W = self._parameters.weights(theta)

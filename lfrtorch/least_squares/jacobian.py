@@ -1,11 +1,11 @@
 """Jacobian of the residual: its least-squares system and its products with vectors.
 
 A step of the search solves a least-squares problem with J, which has a row for every sample and
-output and a column for every parameter. For long records J is too large to hold, and the step does
-not need it: a small matrix with the same JᵀJ will do. So the rows are computed block by block, each
-block is folded into an accumulator (``linear_systems``), and is then dropped. Where that saves
-time, columns that are combinations of others (``gauge``) are not computed. ``output_rows`` has the
-rows of simulated outputs.
+output and a column for every parameter. For long records J is too large to hold, but a step only
+needs a small matrix with the same JᵀJ. So the rows are computed block by block. Each block is added
+to an accumulator (``linear_systems``) and then dropped. Columns that are combinations of others
+(``gauge``) are not computed if that saves time. ``output_rows`` computes the rows of simulated
+outputs.
 """
 
 from __future__ import annotations
@@ -32,17 +32,18 @@ from lfrtorch.least_squares.term import PenaltyRows, TermRows
 EPS = torch.finfo(torch.float64).eps
 
 NORMAL = 1e4
-"""Relative damping, in rounding errors, above which the normal equations are as good as QR."""
+"""Relative damping, in units of rounding errors, above which normal equations are as good as QR."""
 
 CACHED_BYTES = 1 << 27
-"""Rows are cached up to this size, all groups together."""
+"""Largest size of the cached rows of all groups together."""
 
 
 class Jacobian:
     """J (M, P) of a residual at one θ."""
 
-    # ``project`` leaves what is held, columns of zeros. The first ``shared`` columns are those of
-    # parameters that all records have; the others are of start states that the parts eliminate.
+    # ``project`` makes the columns of held entries zero. The first ``shared`` columns are those of
+    # parameters that all records share. The other columns are of start states, which the parts
+    # eliminate.
 
     def __init__(
         self,
@@ -60,8 +61,8 @@ class Jacobian:
         """The least-squares system of J and its gradient Jᵀr; see the search's ``Jacobian``."""
         gram = damping > NORMAL * EPS
         total = GramAccumulator() if gram else QRAccumulator()
-        # Rows [J r] of outputs in the kept columns. Those of a penalty are added to all columns:
-        # they are no combinations.
+        # Rows [J r] of outputs are computed in the kept columns. Rows of a penalty are added to all
+        # columns, as they are not combinations of kept columns.
         penalties = [part for part in self.parts if isinstance(part, PenaltyRows)]
         states, room = [], CACHED_BYTES
         for part in self.parts:
@@ -88,7 +89,7 @@ class Jacobian:
         return system, gradient
 
     def _complete(self, total: QRAccumulator | GramAccumulator) -> None:
-        """Add the rows that others have; there are none."""
+        """Add the rows of other processes; here there are none."""
 
     def _normal(
         self, G: Float[Tensor, "columns columns"], penalty: Float[Tensor, " P"] | None
@@ -100,7 +101,7 @@ class Jacobian:
             ridge = 0.0 if penalty is None else float(penalty[0])
             if penalty is None or bool((penalty == ridge).all()):
                 return ReducedSystem(G, expand, ridge), gradient
-        # JᵀJ = expandᵀ G expand: the columns first, then the rows of a symmetric matrix.
+        # JᵀJ = expandᵀ G expand: expand the columns, transpose, and expand the columns again.
         if expand is not None:
             G = self._reduced.columns(self._reduced.columns(G).mT)
         G = self._project(self._project(G).mT)
@@ -123,7 +124,7 @@ class Jacobian:
         penalty: Float[Tensor, " P"] | None,
         truncation: float,
     ) -> tuple[System, Float[Tensor, " P"]]:
-        """The system and the gradient, the start states eliminated."""
+        """The system and the gradient, with the start states eliminated."""
         states = StartStates(*map(torch.cat, zip(*found, strict=True)))
         states = states._replace(A=self._project(states.A))
         gram = isinstance(total, GramAccumulator)

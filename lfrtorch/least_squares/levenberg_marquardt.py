@@ -1,8 +1,8 @@
 """Levenberg-Marquardt with geodesic acceleration, for any least-squares problem.
 
-Minimises |r(θ)|² with the damping λI, so that the coordinates of θ decide: signals and states
-should be scaled to unit variance. (Marquardt's scaling by column norms stalled at 7e-5 m where
-this one reaches 3e-6 m: saturated neurons have vanishing columns and their weights run off.)
+Minimises |r(θ)|² with the damping λI. The result depends on the scaling of θ, so signals and states
+should be scaled to unit variance. Marquardt's scaling by column norms stalled at 7e-5 m where λI
+reaches 3e-6 m: saturated neurons have vanishing columns, and their weights run off.
 
 References:
     Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05 (the damping rule).
@@ -32,30 +32,31 @@ from lfrtorch.least_squares.options import LevenbergMarquardtOptions
 from lfrtorch.least_squares.residual import Jacobian, LeastSquares, Point
 
 FASTEST_DECREASE = 0.2
-"""Smallest factor on λ after an accepted step; Nielsen has 1/3."""
+"""Smallest factor on λ after an accepted step; Nielsen uses 1/3."""
 
 FIRST = 0.1
-"""Factor on λ from trial to trial of the first step, as long as the decrease grows by this part.
+"""Factor on λ between trials of the first step. Trials go on while each decreases the cost by at
+least 10 % more than the one before.
 
-The gain ratio stays near 1 down to some λ, and is far below 0 at the next two. The saving is
-in benchmarks/starts.md.
+As λ falls the gain ratio stays near 1 at first, and is then far below 0 within two trials. The
+saving is in benchmarks/starts.md.
 """
 
 TAKEN_BACK = 10.0
-"""Factor on λ after an undone step: reverts the largest decrease (1/0.2 = 5) and doubles."""
+"""Factor on λ after an undone step: twice the factor 1/0.2 = 5 that undoes the largest decrease."""
 
 
 @dataclass(frozen=True)
 class LMState:
-    """Where the search stands: θ, r(θ), its cost |r|² and the damping λ of the next trial."""
+    """State of the search: θ, r(θ), the cost |r|² and the damping λ of the next trial."""
 
     theta: Float[Tensor, " P"]
     residual: Float[Tensor, " M"]
     cost: float
-    seen: tuple[Any, ...] = ()  # of ``Point``
+    seen: tuple[Any, ...] = ()  # see ``Point``
     damping: float | None = None  # None before the first step
     scale: float = 1.0  # about the largest squared singular value of J in the last step
-    growth: float = 2.0  # factor of λ on the next rejection
+    growth: float = 2.0  # factor on λ if the next trial is rejected
     iteration: int = 0  # accepted and refused steps
     gain_ratio: float = float("nan")
     trials: int = 0
@@ -65,7 +66,7 @@ class LMState:
 
     @cached_property
     def point(self) -> Point:
-        """θ and what was found there."""
+        """The evaluation at θ."""
         return Point(self.theta, self.residual, self.cost, self.seen)
 
     @property
@@ -82,7 +83,7 @@ class LMState:
 
 
 class _Trial(NamedTuple):
-    """A step and what it reached."""
+    """A step and the point that it reached."""
 
     point: Point
     damping: float
@@ -109,11 +110,11 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
 
     @property
     def limit(self) -> int:
-        """Most iterations."""
+        """Largest number of iterations."""
         return self.max_iter
 
     def init(self, problem: LeastSquares, theta: Tensor, point: Point | None = None) -> LMState:
-        """State at the first θ, and what was found there if it is known."""
+        """State at the first θ; ``point`` is the evaluation there, if it is known."""
         point = problem.evaluate(theta) if point is None else point
         if not math.isfinite(point.cost):
             raise InputError(
@@ -123,7 +124,7 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
 
     def step(self, problem: LeastSquares, state: LMState) -> LMState:
         """One iteration: linearise, then raise the damping until a step lowers the cost."""
-        # The first one also lowers it, as long as the next step is better.
+        # The first iteration also lowers the damping, as long as the next trial is better.
         jacobian = problem.linearise_at(state.point)
         damping, least = state.damping, math.inf
         first = min(self.damping, self.least_damping)
@@ -132,7 +133,7 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
         scale = system.scale if damping is None else system.size
         if not 0.0 < scale < math.inf:
             return replace(state, reason=Reason.JACOBIAN_VANISHES)
-        if damping is None:  # to be lowered within this step
+        if damping is None:  # the first iteration may lower the damping down to ``least``
             damping, least = self.damping * scale, self.least_damping * scale
         growth, trials, gain_ratio = state.growth, 0, float("nan")
         best: _Trial | None = None
@@ -173,7 +174,7 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
             quiet=quiet,
         )
         floor = self.floor**2 * problem.cost(torch.ones_like(best.point.residual))
-        if max(accepted.cost, state.cost) <= floor:  # one more step for what is hardly determined
+        if max(accepted.cost, state.cost) <= floor:  # one more step for poorly determined θ
             return replace(accepted, reason=Reason.RESIDUAL_VANISHES)
         if quiet >= self.patience:
             return replace(accepted, reason=Reason.COST_SETTLED)
@@ -182,7 +183,7 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
         return accepted
 
     def refused(self, before: LMState, after: LMState) -> LMState:
-        """State to go on from after a step that is undone: it was too long."""
+        """State to go on from after a step is undone: the state before, with a larger damping."""
         assert after.damping is not None
         return replace(
             before,
@@ -195,7 +196,7 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
         )
 
     def prolonged(self, state: LMState) -> LMState:
-        """State to go on from if all iterations were spent and there are more now."""
+        """State to go on from; a search that used up its iterations goes on if the limit rises."""
         spent = state.reason == Reason.ALL_ITERATIONS and state.iteration < self.max_iter
         return replace(state, reason="") if spent else state
 
@@ -210,7 +211,7 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
     ) -> _Trial:
         """The step at one damping."""
         delta = system.solve(gradient, damping)
-        # Decrease of |r + J δ|² by the δ with (JᵀJ + λI) δ = -gradient.
+        # Predicted decrease of |r + J δ|² for the δ with (JᵀJ + λI) δ = -gradient.
         predicted = damping * float(delta @ delta) - float(gradient @ delta)
         theta = state.theta + delta
         if self.acceleration:
@@ -233,7 +234,7 @@ class LevenbergMarquardt(LevenbergMarquardtOptions):
         ahead = problem.evaluate(state.theta + h * delta, state.point)
         if not math.isfinite(ahead.cost):
             return torch.zeros_like(delta)
-        # r'' along δ, from r(θ + hδ) = r + h J δ + h² r'' / 2 + O(h³).
+        # Second derivative r'' along δ, from r(θ + hδ) = r + h J δ + h² r'' / 2 + O(h³).
         second = (
             (ahead.residual - state.residual).div_(h).sub_(jacobian.tangent(delta)).mul_(2.0 / h)
         )

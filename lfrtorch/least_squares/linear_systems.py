@@ -1,10 +1,10 @@
 """Damped least-squares systems (JᵀJ + λI) δ = -gradient from rows of J that come in blocks.
 
-J is long and narrow. An accumulator takes in its rows, block by block, and holds a square matrix:
-R with RᵀR = JᵀJ (``QRAccumulator``, all digits) or JᵀJ itself (``GramAccumulator``, three times
-faster, half the digits). Either is the same whatever the blocks and their order, which is how
-blocks of time, threads and processes share the work. A system then solves for the step δ at any
-damping λ: ``SVDSystem`` from R, ``CholeskySystem`` and ``ReducedSystem`` from JᵀJ.
+J is long and narrow. An accumulator adds its rows, block by block, to a square matrix: R with
+RᵀR = JᵀJ (``QRAccumulator``, all digits), or JᵀJ itself (``GramAccumulator``, three times faster,
+half the digits). Up to rounding neither matrix depends on the blocks or their order, so blocks of
+time, threads and processes can share the work. A system then solves for the step δ at any damping
+λ: ``SVDSystem`` uses R, ``CholeskySystem`` and ``ReducedSystem`` use JᵀJ.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from lfrtorch._support.threads import has_kernels, spread, to_float64
 from lfrtorch._support.types import Array
 
 MERGED = 16
-"""Triangles are merged into one when they have this many times the rows of one."""
+"""Triangles are merged when together they have this many times the rows of one triangle."""
 
 PIECES = 16
-"""Most pieces of the rows for the threads."""
+"""Largest number of pieces that the rows are cut into for the threads."""
 
 TALL = 8
-"""Least ratio of height to width of a piece: the merge of the triangles then takes at most an
-eighth of the work."""
+"""Smallest ratio of height to width of a piece: merging the triangles then takes at most an eighth
+of the work."""
 
 WIDE = 256
-"""Columns above which JᵀJ of few rows is found in panels that the threads share."""
+"""Number of columns above which JᵀJ of few rows is computed in panels that the threads share."""
 
 PANELS = 16
 """Number of these panels."""
 
 KRYLOV = 400
-"""Parameters from which the largest eigenvalue is found without the others."""
+"""Number of parameters from which the largest eigenvalue is computed without the others."""
 
 
 @runtime_checkable
 class System(Protocol):
-    """JᵀJ decomposed, for several dampings."""
+    """A decomposition of JᵀJ that solves for steps at several dampings."""
 
     @property
     def scale(self) -> float:
@@ -53,10 +53,10 @@ class System(Protocol):
         ...
 
     size: float
-    """The same or more, by a factor of √P at most, at no cost."""
+    """An upper bound on ``scale``, at most √P times as large, that costs nothing."""
 
     rank: int
-    """Directions that J sees."""
+    """Number of directions of θ that change the residual."""
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
         """-(JᵀJ + λI)⁻¹ gradient."""
@@ -64,21 +64,21 @@ class System(Protocol):
 
 
 class SVDSystem:
-    """From R with RᵀR = JᵀJ, by singular values: exact for any damping."""
+    """System from R with RᵀR = JᵀJ, by singular values: exact for any damping."""
 
     def __init__(self, R: Float[Tensor, "K P"], truncation: float) -> None:
         self.scale = self.size = float("nan")
         self.rank = 0
         if torch.isfinite(R).all():
             s, Vh = _singular(R)
-            kept = s > truncation * s[:1]  # of no rows there is none
-            # A parameter that R does not see stays as it is, to the last bit.
+            kept = s > truncation * s[:1]  # s is empty if there are no rows
+            # A parameter whose column in R is zero does not change, to the last bit.
             self._squares, self._Vh = s[kept].square(), Vh[kept].masked_fill((R == 0).all(0), 0.0)
             self.scale = self.size = float(s[:1].square().sum())
             self.rank = len(self._squares)
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
-        """-(JᵀJ + λI)⁻¹ gradient, without its part along the directions that are left out."""
+        """-(JᵀJ + λI)⁻¹ gradient, without the part along truncated directions."""
         return -self._Vh.mT @ ((self._Vh @ gradient) / (self._squares + damping))
 
     @property
@@ -88,16 +88,16 @@ class SVDSystem:
 
 
 def _singular(R: Float[Tensor, "K P"]) -> tuple[Tensor, Tensor]:
-    """Singular values and right singular vectors, also of a matrix on which the fast way ends."""
+    """Singular values and right singular vectors, also if the fast method fails."""
     try:
         _, s, Vh = torch.linalg.svd(R, full_matrices=False)
-    except RuntimeError:  # divide and conquer; the sweeps of QR always converge
+    except RuntimeError:  # divide and conquer has failed; QR sweeps always converge
         _, s, Vh = scipy.linalg.svd(to_float64(R), full_matrices=False, lapack_driver="gesvd")
     return torch.as_tensor(s).to(R), torch.as_tensor(Vh).to(R)
 
 
 class CholeskySystem:
-    """From G = JᵀJ, by Cholesky: three times faster, for λ well above the rounding errors of G."""
+    """System from G = JᵀJ, by Cholesky: three times faster, for λ well above G's rounding."""
 
     def __init__(self, G: Float[Tensor, "P P"], rank: int) -> None:
         self._G, self.rank = G, rank
@@ -120,15 +120,15 @@ class CholeskySystem:
 
 
 class ReducedSystem:
-    """From G = JᵀJ in K columns of which all P are combinations, J = J[:, kept] E."""
+    """System from G, JᵀJ in K kept columns, where all P columns are J = J[:, kept] E."""
 
-    # With E Eᵀ = L Lᵀ the rows of L⁻¹ E are orthonormal, and span all that J sees. In their
-    # coordinates JᵀJ is Lᵀ G L, so nothing of size P × P is formed. The ridge is added to each
-    # eigenvalue of JᵀJ, those of other directions included.
+    # With E Eᵀ = L Lᵀ the rows of L⁻¹ E are orthonormal, and span all directions that change the
+    # residual. In these coordinates JᵀJ is Lᵀ G L, so no P × P matrix is formed. The ridge is added
+    # to every eigenvalue of JᵀJ, including the zero eigenvalues of the other directions.
 
     def __init__(self, G: Float[Tensor, "K K"], expand: Float[Tensor, "K P"], ridge: float) -> None:
         self._expand, self._ridge, self.rank = expand, ridge, len(G)
-        # E Eᵀ is as badly conditioned as E squared: too much for single precision.
+        # The condition number of E Eᵀ is that of E squared: too large for single precision.
         wide = expand.double()
         self._L = torch.linalg.cholesky(wide @ wide.mT).to(expand)
         own = self._L.mT @ G @ self._L
@@ -152,19 +152,19 @@ class ReducedSystem:
         return step
 
     def _back(self, own: Float[Tensor, "K 1"]) -> Float[Tensor, " P"]:
-        """A vector in the coordinates of θ."""
+        """A vector in the reduced coordinates, transformed to those of θ."""
         kept = torch.linalg.solve_triangular(self._L.mT, own, upper=True)
         return self._expand.mT @ kept.squeeze(-1)
 
 
 def largest_eigenvalue(G: Float[Tensor, "P P"]) -> float:
-    """Largest eigenvalue of a symmetric matrix; by some thirty products (Krylov) if it is large."""
+    """Largest eigenvalue of a symmetric matrix; a large matrix takes about thirty products."""
     if len(G) < KRYLOV or not has_kernels(G):
         return float(torch.linalg.eigvalsh(G)[-1])
-    start = np.ones(len(G), G.numpy().dtype)  # ARPACK's own would be random
+    start = np.ones(len(G), G.numpy().dtype)  # ARPACK's default start is random
     try:
         return float(eigsh(G.numpy(), k=1, which="LA", v0=start, return_eigenvectors=False)[0])
-    except ArpackError:  # it did not converge, or G is zero
+    except ArpackError:  # ARPACK did not converge, or G is zero
         return float(torch.linalg.eigvalsh(G)[-1])
 
 
@@ -187,23 +187,23 @@ class QRAccumulator:
         width: int,
         tie: Float[Tensor, "m n-1"] | None = None,
     ) -> None:
-        """Add the rows of another, ``tied`` if they shall be, as columns ``place`` of ``width``."""
+        """Add the rows of another accumulator as columns ``place`` of ``width``; see ``tied``."""
         R = other.R if tie is None else tied(other.R, tie)
         wide = R.new_zeros(len(R), width)
         wide[:, place] = R
         self.fold(wide)
 
     def add_columns(self, other: Any, kept: Int[Tensor, " n"]) -> None:
-        """Add some columns of the rows of another."""
+        """Add the rows of another accumulator, in the columns ``kept`` alone."""
         self.fold(other.R[:, kept])
 
     def replace(self, R: Float[Tensor, "k n"]) -> None:
-        """Take another matrix in place of its own."""
+        """Replace the matrix."""
         self._parts = [R]
 
     @property
     def R(self) -> Float[Tensor, "k n"]:
-        """R with k = n rows, or fewer if there are fewer so far; their signs are arbitrary."""
+        """R with k = n rows, or fewer if A has fewer rows; the signs of its rows are arbitrary."""
         if len(self._parts) == 1:
             return self._parts[0]
         return torch.linalg.qr(torch.cat(self._parts), mode="r").R
@@ -234,18 +234,18 @@ class GramAccumulator:
         width: int,
         tie: Float[Tensor, "m n-1"] | None = None,
     ) -> None:
-        """Add the rows of another, ``tied`` if they shall be, as columns ``place`` of ``width``."""
+        """Add the rows of another accumulator as columns ``place`` of ``width``; see ``tied``."""
         if not self._parts:
             self._parts = [other.G.new_zeros(width, width)]
         G = other.G if tie is None else tied(tied(other.G, tie).mT, tie)
         self._parts[0][place.unsqueeze(1), place] += G
 
     def add_columns(self, other: Any, kept: Int[Tensor, " n"]) -> None:
-        """Add some columns of the rows of another."""
+        """Add the rows of another accumulator, in the columns ``kept`` alone."""
         self.add(other.G[kept.unsqueeze(1), kept])
 
     def replace(self, G: Float[Tensor, "n n"]) -> None:
-        """Take another matrix in place of its own."""
+        """Replace the matrix."""
         self._parts = [G]
 
     @property
@@ -260,7 +260,7 @@ class GramAccumulator:
 
 
 def tied(rows: Float[Tensor, "M columns"], tie: Float[Tensor, "m n"]) -> Float[Tensor, "M n+1"]:
-    """Rows of n + 1 columns from n + m + 1: m, all before the last, follow from the first n."""
+    """Rows of n + 1 columns, from n + m + 1 of which m, before the last, depend on the first n."""
     m, n = tie.shape
     return torch.cat([rows[:, :n] + rows[:, n : n + m] @ tie, rows[:, -1:]], dim=1)
 
@@ -269,7 +269,7 @@ def _of_pieces(
     kernel: Callable[[int, Sequence[Tensor], list[Tensor]], None], rows: Tensor
 ) -> list[Tensor]:
     """The kernel's results for pieces of the rows, which the threads share."""
-    # The pieces do not depend on the number of threads, and so neither do the digits of their sum.
+    # The pieces, and so the digits of their sum, do not depend on the number of threads.
     pieces = rows.tensor_split(_pieces(rows))
     parts: list[Tensor] = [rows[:0]] * len(pieces)
     spread(kernel, len(pieces), pieces, parts)
@@ -290,7 +290,7 @@ def _square(job: int, pieces: Sequence[Tensor], parts: list[Tensor]) -> None:
 
 
 def _add_panels(job: int, edges: Array, rows: Array, G: Array) -> None:
-    """Add two panels of rowsᵀ rows to G: one wide and one narrow, so that all jobs are alike."""
+    """Add a wide and a narrow panel of rowsᵀ rows to G, so that all jobs take equally long."""
     for panel in (job, PANELS - 1 - job):
         first, last = edges[panel], edges[panel + 1]
         own = rows[:, first:last]
@@ -301,8 +301,8 @@ def _add_panels(job: int, edges: Array, rows: Array, G: Array) -> None:
 
 
 def product(left: Float[Tensor, "m k"], right: Float[Tensor, "k n"]) -> Float[Tensor, "m n"]:
-    """left @ right, by numpy on the CPU: faster if k is large, and one triangle of a square."""
+    """left @ right; on the CPU by numpy, which is faster if k is large or the factors are equal."""
     if not has_kernels(left):
         return left @ right
-    with np.errstate(over="ignore", invalid="ignore"):  # such a system has no scale
+    with np.errstate(over="ignore", invalid="ignore"):  # the scale of such a system is NaN
         return torch.from_numpy(left.numpy() @ right.numpy())

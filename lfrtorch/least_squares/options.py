@@ -1,4 +1,4 @@
-"""Options of the searches, without what computes: the help of the command line reads them."""
+"""Options of the searches, without their code, for the help of the command line."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from lfrtorch._support.settings import check_settings, setting
 
 _GUARANTEE: Any = setting(
     None,
-    'what every model on the way keeps. ``"stable"``: A\'s eigenvalues stay within the unit '
-    "circle, so that no bounded input makes a model with a bounded static map run away; if "
-    "they are not inside at the start, they stay within the circle that they are in. "
-    '``"contracting"``: the model is proven to contract, for all inputs, see '
-    "``lfrtorch.analysis.contraction``; the start must be. A number below 1, as 0.98: it is proven "
-    "to contract by that rate. Default: nothing.",
-)  # the field of both searches
+    'property that the model keeps at every iteration. ``"stable"``: the eigenvalues of A stay '
+    "within the unit circle, or within the smallest circle that has them at the start. With a "
+    "bounded static map no bounded input then makes the model run away. "
+    '``"contracting"``: the model is proven to contract for all inputs, as the start must be, see '
+    "``lfrtorch.analysis.contraction``. A number below 1, such as 0.98: the model is proven to "
+    "contract at this rate. Default: none.",
+)  # used by both searches
 
 
 def check_guarantee(given: object) -> None:
-    """Refuse a rate that is none."""
+    """Refuse a rate that is not between 0 and 1."""
     if isinstance(given, int | float) and not 0.0 < given < 1.0:
         raise InputError(f"guarantee is {given!r}; give a rate above 0 and below 1, or a name.")
 
@@ -37,20 +37,20 @@ class LevenbergMarquardtOptions:
         positive=True,
     )
     tolerance: float = setting(
-        1e-7, "relative decrease of the cost that counts as no progress ...", positive=False
+        1e-7, "relative decrease of the cost up to which a step is no progress.", positive=False
     )
     patience: int = setting(
-        5, "... and the number of such steps in a row that ends the search.", least=1
+        5, "number of steps in a row without progress that ends the search.", least=1
     )
     floor: float = setting(
         1e-13,
-        "root mean square of the residual that counts as zero: the search ends one step later.",
+        "root mean square of the residual that counts as zero; the search ends one step later.",
         positive=False,
     )
     truncation: float = setting(
         1e-12,
-        "singular values below this part of the largest are left out as gauge. They are computed "
-        "only if the damping is not far above rounding errors.",
+        "part of the largest singular value below which others are left out as gauge directions. "
+        "They are computed only if the damping is not far above rounding errors.",
         positive=True,
     )
     finite_step: float = setting(
@@ -66,8 +66,8 @@ class LevenbergMarquardtOptions:
     )
     least_damping: float = setting(
         1e-8,
-        "to which the first step may lower λ, in trials from the same Jacobian; with ``damping`` "
-        "or more it does not.",
+        "relative λ down to which the first iteration may lower it, in trials from one Jacobian. "
+        "The first iteration does not lower λ if this is ``damping`` or more.",
         positive=True,
     )
     guarantee: Literal["stable", "contracting"] | float | None = _GUARANTEE
@@ -81,7 +81,7 @@ class LevenbergMarquardtOptions:
 class AdamOptions:
     """Options of :class:`lfrtorch.Adam`."""
 
-    max_iter: int = setting(2000, "most epochs; each sees all the data.", least=0)
+    max_iter: int = setting(2000, "largest number of epochs over all the data.", least=0)
     learning_rate: float = setting(1e-3, "step size, in normalised units.", positive=True)
     guarantee: Literal["stable", "contracting"] | float | None = _GUARANTEE
 

@@ -1,4 +1,4 @@
-"""Columns of the Jacobian that need no recurrence: those of the output's own weights."""
+"""Columns of the Jacobian that need no recurrence: the columns of Cy, Dyu and Dyw."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from lfrtorch.least_squares.linear_systems import product, tied
 
 
 class OutputColumns:
-    """The columns of Cy, Dyu and Dyw, and their products with the others."""
+    """The columns of Cy, Dyu and Dyw, and their products with the other columns."""
 
-    # The derivative of an output by a factor of a signal in v = [x; u; w] is that signal, and that
-    # of the other outputs is zero. So the products of these columns are those of a few signals, and
-    # the columns need not be made. All samples must count alike.
+    # An entry of Cy, Dyu or Dyw multiplies a signal of v = [x; u; w]. The derivative of its output
+    # by this entry is that signal; the derivatives of other outputs are zero. So the products of
+    # these columns are products of a few signals, and the columns are never formed. All samples
+    # must have the same weight.
 
     def __init__(self, linearisation: Linearisation, own: Int[Tensor, " K"]) -> None:
         self._linearisation = linearisation
@@ -25,13 +26,13 @@ class OutputColumns:
         self._of_signals: dict[int, Tensor] = {}
 
     def without(self, each: Int[Tensor, " K"]) -> Int[Tensor, " K_other"]:
-        """The entries of the other columns."""
+        """The entries of ``each`` that belong to the other columns."""
         other = torch.ones(len(each), dtype=torch.bool, device=each.device)
         other[self.place] = False
         return each[other]
 
     def fold(self, to: int, r: int, time: slice, rows: Float[Tensor, "B ny C"]) -> None:
-        """Add the products of record r with the other columns, at some samples, to sum ``to``."""
+        """Add the products with record r's other columns, at some samples, to the sum ``to``."""
         v = self._linearisation.signals(slice(r, r + 1), time)[0]
         with_rows, of_signals = product(v.mT, rows.flatten(1)), product(v.mT, v)
         if to in self._with_rows:
@@ -46,7 +47,7 @@ class OutputColumns:
         width: int,
         tie: Float[Tensor, "m n-1"] | None,
     ) -> Float[Tensor, "{width} {width}"]:
-        """JᵀJ, of ``width`` columns, without the products of the others, at ``place``."""
+        """JᵀJ with ``width`` columns, but for products among the other columns, at ``place``."""
         outputs = self._linearisation.trajectory.y.shape[2]
         with_rows = self._with_rows[of].unflatten(1, (outputs, -1))[self._signal, self._output]
         if tie is not None:

@@ -24,27 +24,27 @@ from lfrtorch.least_squares.record_groups import RecordGroup
 from lfrtorch.least_squares.start_states import Eliminator, StartStates
 
 MANY = 64
-"""Records from which on their products are one call, rather than one for each on some thread."""
+"""Number of records from which one call computes the products of all records."""
 
 SPECTRA = 16
-"""Columns that are turned into spectra at once, which need copies."""
+"""Number of columns that are transformed to spectra at once, as spectra need copies."""
 
 
 class Memory:
-    """Buffers for rows, handed on from one Jacobian to the next that asks for the same size."""
+    """Buffers for rows; a Jacobian takes over the buffer of an earlier one of the same size."""
 
-    # A fresh allocation took a fifth of an iteration on the parallel Wiener-Hammerstein benchmark.
+    # New allocations took a fifth of an iteration on the parallel Wiener-Hammerstein benchmark.
 
     def __init__(self) -> None:
         self._free: dict[int, list[Tensor]] = {}
 
     def take(self, owner: object, shape: Sequence[int], like: Tensor) -> Tensor:
-        """A buffer of that shape, until the owner is garbage."""
+        """A buffer of that shape, until the owner is garbage-collected."""
         size = math.prod(shape)
         if self._free.get(size):
             buffer = self._free[size].pop()
         else:
-            self._free.clear()  # other sizes than before
+            self._free.clear()  # the free buffers have other sizes
             buffer = like.new_empty(size)
         weakref.finalize(owner, self._give, buffer)
         return buffer.view(*shape)
@@ -54,10 +54,10 @@ class Memory:
 
 
 class _Cached(NamedTuple):
-    """Weighted rows of each record, and where their first n columns stand among the kept ones."""
+    """Weighted rows of each record, and the places of their first n columns among the kept ones."""
 
-    # If the initial state of a record follows from the other parameters, its columns are the last
-    # nx; otherwise C = n.
+    # If the initial state of a record depends on the other parameters, the last nx columns are
+    # those of the initial state; otherwise C = n.
 
     rows: Float[Tensor, "R T*ny C"]
     places: Int[Tensor, "R n"]
@@ -67,7 +67,7 @@ class _Cached(NamedTuple):
 class OutputRows:
     """The rows of one group of records."""
 
-    # ``x0``: where the initial state of each record stands in θ, if they are parameters.
+    # ``x0`` has the places in θ of each record's initial state, if initial states are parameters.
 
     def __init__(
         self,
@@ -88,12 +88,12 @@ class OutputRows:
         self._buffer: Tensor | None = None
         self._cached: _Cached | None = None
         self._tied: tuple[Tensor, Tensor, Tensor] | None = None
-        """Kept parameters, those of them that move the initial state, and how."""
+        """Kept parameters, those of them that change the initial state, and its derivative."""
 
     def fold(
         self, kept: Int[Tensor, " K"], total: QRAccumulator | GramAccumulator, room: int
     ) -> int:
-        """Add the weighted rows [J r] in the kept columns; bytes cached, at most ``room``."""
+        """Add weighted rows [J r] in the kept columns; return the bytes cached, up to ``room``."""
         group, linearisation = self.group, self.linearisation
         P = linearisation.parameters
         own = kept if int(kept[-1]) < P else kept[kept < P]  # ascending
@@ -107,8 +107,8 @@ class OutputRows:
             direct = OutputColumns(linearisation, own)
             columns = direct.without(own)
             shape = (*errors.shape, shape[-1] - len(direct.place))
-        # The columns of the initial state turn into others, for each record in its own way. So each
-        # record has an accumulator of its own then.
+        # Columns of an initial state are combined with or placed among other columns, in another
+        # way for each record. So each record then has its own accumulator.
         eliminator, sums = None, [total]
         if self._eliminate and self.x0 is not None:
             eliminator = Eliminator(self.x0, group.u.shape[1], total)
@@ -117,7 +117,7 @@ class OutputRows:
         elif direct is not None or len(own) < len(kept):
             sums = [type(total)()]
         end = errors.new_empty(len(errors), nx, shape[-1] - 1)
-        # A spectrum is taken of whole records, too.
+        # A spectrum also needs the rows of whole records.
         for block in self._blocks(columns, shape if cache or group.spectral else None):
             rows, records = block.rows, block.records
             rows[..., -1] = errors[records, block.time]
@@ -138,7 +138,7 @@ class OutputRows:
         places, initial = self._columns(kept, own, direct, end)
         self._tied = None if initial is None else (kept, places, initial)
         if eliminator is None and sums[0] is not total:
-            # The residual is the last column before and after.
+            # The residual is the last column in both numberings.
             last = places.new_full((len(places), 1), len(kept))
             for r, accumulator in enumerate(sums):
                 place = torch.cat([places, last], dim=1)[r]
@@ -153,7 +153,7 @@ class OutputRows:
         return size
 
     def _weighted(self, rows: Tensor, records: slice, time: slice, *, keep: bool) -> Tensor:
-        """Weighted rows; in their own place if they are kept or all spectra."""
+        """Weighted rows; they overwrite the rows if these are kept or are spectra."""
         group = self.group
         if group.plain:
             return rows
@@ -165,7 +165,7 @@ class OutputRows:
         return rows.copy_(weighted) if keep else weighted
 
     def _blocks(self, own: Int[Tensor, " K"], shape: tuple[int, ...] | None) -> Iterable[Rows]:
-        """The rows in those columns, written to a buffer if it has a shape."""
+        """The rows in the columns ``own``, written to a buffer if ``shape`` is given."""
         if shape is not None and (self._buffer is None or self._buffer.shape != shape):
             self._buffer = self._memory.take(self, shape, self.group.y)
         return self.linearisation.rows(
@@ -182,9 +182,10 @@ class OutputRows:
         direct: OutputColumns | None,
         end: Float[Tensor, "R nx C"],
     ) -> tuple[Int[Tensor, "R n"], Float[Tensor, "R nx n"] | None]:
-        """Where the columns of each record stand among the kept ones, and dx0/dθ if it is tied."""
-        # The first K are the same for all. An initial state that is a parameter has places of its
-        # own. That of a periodic record depends on the other parameters, dx0/dθ = (I - Φ)⁻¹ end.
+        """Places of each record's columns among the kept ones, and dx0/dθ if x0 depends on θ."""
+        # The first K places are the same for all records. An initial state that is a parameter has
+        # its own places. The initial state of a periodic record depends on the other parameters:
+        # dx0/dθ = (I - Φ)⁻¹ end.
         among_kept = torch.arange(len(own), device=end.device)
         among_kept = among_kept if direct is None else direct.without(among_kept)
         K = len(among_kept)
@@ -199,7 +200,7 @@ class OutputRows:
     def tangent(
         self, d_theta: Float[Tensor, " P"], reduced: Float[Tensor, " K"]
     ) -> Float[Tensor, " count"]:
-        """Weighted changes of the outputs: J dθ, given as well in the kept columns."""
+        """Weighted changes of the outputs, J dθ; ``reduced`` is dθ in the kept columns."""
         if self._cached is not None:
             rows, places, initial = self._cached
             by_column = reduced[places]
@@ -212,7 +213,7 @@ class OutputRows:
         linearisation = self.linearisation
         d_x0 = None if self.x0 is None else d_theta[self.x0]
         if self._tied is not None:
-            # Another change with the same outputs: of the kept parameters alone.
+            # A change of the kept parameters alone that changes the outputs in the same way.
             kept, places, initial = self._tied
             d_theta = torch.zeros_like(d_theta).index_put_((kept,), reduced)
             d_x0 = (initial @ reduced[places].unsqueeze(-1)).squeeze(-1)
@@ -225,7 +226,7 @@ class OutputRows:
         gradient: Float[Tensor, " P"],
         reduced: Float[Tensor, " K"],
     ) -> None:
-        """Add Jᵀ residual to the gradient, or to the one in the kept columns if there are rows."""
+        """Add Jᵀ residual to the gradient, or to ``reduced`` if rows are cached."""
         if self._cached is not None:
             rows, places, initial = self._cached
             by_column = _product(rows.mT, residual.reshape(len(rows), -1))
@@ -257,7 +258,7 @@ class OutputRows:
 def _product(
     matrices: Float[Tensor, "R m n"], vectors: Float[Tensor, "R n"]
 ) -> Float[Tensor, "R m"]:
-    """The matrix of each record times its vector, the records shared by the threads."""
+    """The matrix of each record times its vector; the threads share the records."""
     if len(matrices) == 1:
         return torch.mv(matrices[0], vectors[0]).unsqueeze(0)
     if len(matrices) > MANY and has_kernels(matrices):

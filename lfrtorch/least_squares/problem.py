@@ -34,17 +34,17 @@ if TYPE_CHECKING:
 State = TypeVar("State")
 
 BATCH = 32
-"""Records in a minibatch, about."""
+"""Approximate number of records in a minibatch."""
 
 REDUCING = 2e7
-"""Products that dependent columns of J take, from which they are left out."""
+"""Dependent columns of J are left out if they would take more products than this."""
 
 
 class Problem(LeastSquares):
-    """r(θ): the residual of each term, one after another; a ridge is the last."""
+    """r(θ): the residuals of all terms in a row; a ridge is the last term."""
 
-    # θ are the free numbers of an LFR, then the initial states of the records whose start is
-    # ``"estimated"``; θ_0 is θ at the start. The LFR is read once, and gets a θ by ``write`` alone.
+    # θ has the free numbers of an LFR, then the initial states of the records whose start is
+    # ``"estimated"``; θ_0 is θ at the start. The LFR is read once; only ``write`` changes it.
 
     def __init__(
         self,
@@ -81,10 +81,10 @@ class Problem(LeastSquares):
 
     @classmethod
     def judge(cls, model: Model, records: Record | Sequence[Record]) -> Self:
-        """The errors on records that are not fitted, each from its most probable initial state."""
+        """The errors on records that are not fitted, from the initial states that fit best."""
         return cls(model.lfr, errors_of(model, records, solve_initial_states=True))
 
-    # What follows is shared by several processes (``shared_problem``), or by one alone.
+    # ``shared_problem`` overrides the methods up to ``_jacobian`` for several processes.
 
     shared = False
     """True if other processes have some of the records."""
@@ -94,11 +94,11 @@ class Problem(LeastSquares):
         return part
 
     def agreed(self, part: Tensor) -> Tensor:
-        """The numbers of the first process, whose rounding errors all go by."""
+        """The numbers of the first process, so that all processes have the same rounding errors."""
         return part
 
     def of_own_records(self, state: State) -> State:
-        """A search's state with the residual of the records that this process has."""
+        """A search's state with the residual of this process's records."""
         return state
 
     @classmethod
@@ -117,16 +117,16 @@ class Problem(LeastSquares):
         return self.errors.size
 
     def read(self) -> Float[Tensor, " P"]:
-        """θ as it stands in the module; initial states are those of θ_0."""
+        """θ from the weights of the LFR; its initial states are those of θ_0."""
         own = self.errors.parameters.read(self.lfr.cell)
         return torch.cat([own, self.theta[len(own) :]])
 
     def write(self, theta: Float[Tensor, " P"]) -> None:
-        """Put θ into the module."""
+        """Write θ to the weights of the LFR."""
         self.errors.parameters.write(self.lfr.cell, theta)
 
     def weigh(self, ridge: Ridge) -> None:
-        """Give the ridge another weight; it still pulls to where the search began."""
+        """Give the ridge another weight; it still pulls towards θ_0."""
         weight = ridge_by_entry(ridge, self.errors.parameters.sizes)
         self._terms = [term for term in self._terms if not isinstance(term, RidgePenalty)]
         if weight.any():
@@ -135,7 +135,8 @@ class Problem(LeastSquares):
     def rmse(self, theta: Float[Tensor, " P"]) -> float:
         """RMSE at θ over scored samples and outputs, unweighted, as in a score.
 
-        In the unit of the outputs; of several units each in that of the scaling, about its rms.
+        It is in the unit of the outputs. If outputs have several units, each is normalised by about
+        its rms.
         """
         return self.rmse_at(self.evaluate(theta))
 
@@ -150,7 +151,7 @@ class Problem(LeastSquares):
     def evaluate(self, theta: Float[Tensor, " P"], near: Point | None = None) -> Point:
         """r at θ, infinite or NaN if the model diverges, and the trajectories.
 
-        ``near`` is a point close by, from whose trajectories the search for these begins.
+        ``near`` is a nearby point, whose trajectories are the first guess.
         """
         before = [None] * len(self._terms) if near is None else near.seen
         terms = zip(self._terms, before, strict=True)
@@ -163,7 +164,7 @@ class Problem(LeastSquares):
         return self.evaluate(theta).residual
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
-        """θ, or one near it that keeps what is held and the guarantee."""
+        """θ, or a nearby θ that keeps held entries and the guarantee."""
         found = self._held.admissible(theta)
         if self._guarantee is None:
             return found
@@ -176,9 +177,9 @@ class Problem(LeastSquares):
     def linearise_at(
         self, point: Point, *, reduce: bool = True, eliminate: bool = True
     ) -> Jacobian:
-        """dr/dθ at a point; ``reduce``: without columns that gauge directions make dependent."""
-        # Initial states are eliminated if they outnumber the parameters; a system without damping
-        # needs them all.
+        """dr/dθ at a point; ``reduce`` leaves out columns that gauge directions make dependent."""
+        # Initial states are eliminated if they outnumber the parameters. A caller that solves
+        # without damping needs all columns, and sets ``eliminate`` to False.
         theta, own = point.theta, self.errors.parameters.own
         states = len(theta) - own
         eliminate = eliminate and states > own and not self.shared
@@ -202,8 +203,8 @@ class Problem(LeastSquares):
 
     @cached_property
     def _worth_reducing(self) -> bool:
-        """Tell if columns that gauge directions make dependent take longer than to find them."""
-        # The damping holds those directions as well: it is a matter of time alone.
+        """Tell if it saves time to find the dependent columns and leave them out."""
+        # The damping also handles gauge directions, so only time decides.
         W, P = self.lfr.cell.weights(), len(self.theta)
         sizes = [s.place.stop - s.place.start for s in W.map.symmetries]
         left = P - W.nx**2 - sum(n**2 for n in sizes)
@@ -211,11 +212,11 @@ class Problem(LeastSquares):
 
     @cached_property
     def rank(self) -> int:
-        """Number of directions of θ that the outputs can tell, without those of the gauge."""
+        """Number of directions of θ that change the outputs: all but the gauge directions."""
         return len(self._reduction(self.theta).kept)
 
     def _reduction(self, theta: Float[Tensor, " P"]) -> Reduction:
-        """The columns that gauge directions leave."""
+        """The columns that must be computed; the others follow by gauge directions."""
         held = any(group.x0 is not None for group in self.errors.groups)
         held = bool(self.total(theta.new_tensor(float(held))))
         found = reduction(
@@ -225,7 +226,7 @@ class Problem(LeastSquares):
             before=self._reduced,
             fixed=self._held.entries,
         )
-        # Rounding errors decide between columns that are as good.
+        # Rounding errors decide between equally good columns, so the first process decides.
         kept, expand = found
         expand = expand if expand is None else self.agreed(expand)
         self._reduced = Reduction(self.agreed(kept), expand)
@@ -240,7 +241,7 @@ class Problem(LeastSquares):
     ) -> tuple[Point, Float[Tensor, " P"]]:
         """r at θ and the gradient of |r|² / samples, by the adjoint recurrence.
 
-        ``near`` is a point close by, or at θ itself.
+        ``near`` is a nearby point, or the point at θ itself.
         """
         known = near is not None and near.theta is theta
         point = near if near is not None and known else self.evaluate(theta, near)
@@ -249,9 +250,10 @@ class Problem(LeastSquares):
         )
 
     def minibatches(self, epoch: int) -> list[Problem]:
-        """Problems of some ``BATCH`` records each, drawn anew in each epoch; of few records, this.
+        """Problems of about ``BATCH`` records each, drawn anew in each epoch.
 
-        Their gradients are those of the mean over their own records.
+        Each has the gradient of the mean over its own records. If there are few records, this
+        problem itself is the only one.
         """
         counts = [len(group.u) for group in self.errors.groups]
         parts = math.ceil(sum(counts) / BATCH)
@@ -259,7 +261,7 @@ class Problem(LeastSquares):
         if sum(counts) < 2 * BATCH or self.shared or len(self._terms) > 1 + len(ridges):
             return [self]
         generator = torch.Generator().manual_seed(epoch)
-        order = torch.randperm(sum(counts), generator=generator)  # of all, and dealt out
+        order = torch.randperm(sum(counts), generator=generator)  # of all records
         firsts, found = [0, *itertools.accumulate(counts)], []
         for i in range(parts):
             part, drawn = copy(self), order[i::parts]
@@ -272,25 +274,25 @@ class Problem(LeastSquares):
         return found
 
     def release(self) -> None:
-        """Free the memory of what only speeds up the next evaluation."""
+        """Free memory that only speeds up the next evaluation."""
         for term in self._terms:
             term.release()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """State besides θ on which the next evaluations depend, to the last bit."""
+        """State besides θ that further evaluations depend on, to the last bit."""
         kept = {} if self._reduced is None else {"kept": self._reduced.kept}
         return {"start": self.theta, **kept}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what the same problem had."""
+        """Restore the state of the same problem."""
         start = tensors["start"]
         same = start.shape == self.theta.shape
         if not same or not torch.allclose(start, self.theta, 1e-6, 1e-6):
             raise InputError(
-                "the fit that is to go on began elsewhere: the data, the settings or the package "
-                "have changed since. Start a new one, from its best model: init_from=DIR."
+                "the interrupted fit had another start: the data, the settings or the package have "
+                "changed since. Start a new fit from its best model: init_from=DIR."
             )
-        self.theta.copy_(start)  # of a ridge, too
+        self.theta.copy_(start)  # the ridge shares this tensor
         if "kept" in tensors:
             self._reduced = Reduction(tensors["kept"], None)
 
@@ -322,7 +324,7 @@ def errors_of(
 
 
 def _check_measured(model: Model) -> None:
-    """Refuse a fit from measured starts of a model whose output has an equation to be fitted."""
+    """Refuse a fit from measured starts if the model's output equation has free parameters."""
     cell = model.lfr.cell
     free = [
         name
@@ -332,7 +334,7 @@ def _check_measured(model: Model) -> None:
     ]
     if free or cell.map.outputs_have_parameters:
         raise InputError(
-            "start='measured' takes the states from the output, whose equation is to be fitted.\n"
+            "start='measured' computes states from outputs, but their equation has parameters.\n"
             "Give a known model whose outputs are states, without parameters, or the matrices "
             "fixed={'Cy': ..., 'Dyu': ..., 'Dyw': ...}; or start='estimated'."
         )

@@ -1,4 +1,4 @@
-"""Groups of records that are simulated together, and how their errors are weighted."""
+"""Groups of records that are simulated together, and the weights of their errors."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ EVERY = slice(None)
 
 @dataclass
 class RecordGroup:
-    """Records of one length and start, normalised, and how their errors are weighted."""
+    """Normalised records of the same length and start, and the weights of their errors."""
 
     u: Float[Tensor, "R T nu"]
     y: Float[Tensor, "R T ny"]
-    x0: Float[Tensor, "R nx"] | None  # at every θ
-    estimated: Int[Tensor, " R"] | None  # numbers of first states that are parameters
+    x0: Float[Tensor, "R nx"] | None  # given initial states, the same at every θ
+    estimated: Int[Tensor, " R"] | None  # numbers of the initial states that are parameters
     scored: Float[Tensor, "R T ny"]
-    weight: Float[Tensor, "R m ny"]  # of samples, or of spectral lines, m = T // 2 + 1
-    start_weight: Float[Tensor, "R T ny"] | None  # estimates the initial state of a given model
+    weight: Float[Tensor, "R m ny"]  # weights of samples, or of the m = T // 2 + 1 spectral lines
+    start_weight: Float[Tensor, "R T ny"] | None  # weights in the estimate of initial states
     spectral: bool
     start: AtRest
-    # Which way an output may be beyond a limit of its sensor: 1, -1 or 0.
+    # 1 if the measurement is at the sensor's upper limit, -1 at the lower limit, otherwise 0.
     beyond: Float[Tensor, "R T ny"] | None = None
     limits: Float[Tensor, "R 2 1 ny"] | None = None
 
@@ -47,12 +47,12 @@ class RecordGroup:
         return replace(self, **cut)
 
     def shown(self, y_hat: Float[Tensor, "R T ny"]) -> Float[Tensor, "R T ny"]:
-        """An output as the sensors show it, which is what a score sees."""
+        """An output clipped to the limits of the sensors, as it is scored."""
         return y_hat if self.limits is None else y_hat.clamp(*self.limits.unbind(1))
 
     def counted(self, y_hat: Float[Tensor, "R T ny"]) -> RecordGroup:
-        """The group with the weights of the samples that count at an output."""
-        # Where the measurement is at a limit and the model beyond it, there is no error.
+        """The group with weight 0 where a saturated measurement agrees with the output."""
+        # If the measurement is at a limit and the model's output is beyond it, there is no error.
         if self.beyond is None:
             return self
         return replace(self, weight=self.weight * (self.beyond * (y_hat - self.y) <= 0))
@@ -64,8 +64,8 @@ class RecordGroup:
         time: slice = EVERY,
     ) -> Float[Tensor, "R T ny *columns"]:
         """Weighted errors, or weighted rows of their Jacobian."""
-        # A spectrum needs all samples. Its T real numbers are the real parts of all lines, and the
-        # imaginary parts of those between 0 and fs / 2.
+        # A spectrum needs all samples. It has T real numbers: the real parts of all lines, and the
+        # imaginary parts of the lines between 0 and fs / 2.
         weight = self.weight[records]
         if not self.spectral:
             weight = weight[:, time]
@@ -94,7 +94,7 @@ class RecordGroup:
 def group_records(
     records: Sequence[NormalisedRecord], model: Weights, own: slice = EVERY
 ) -> list[RecordGroup]:
-    """Records, or some of them, grouped, as tensors like the numbers of the model."""
+    """Groups of records, as tensors of the model's dtype and device; ``own`` selects records."""
     members: dict[tuple[int, Start, bool], list[NormalisedRecord]] = defaultdict(list)
     estimated: dict[tuple[int, Start, bool], list[int]] = defaultdict(list)
     count = itertools.count()
@@ -142,11 +142,11 @@ def _limits(each: NormalisedRecord) -> Float[Array, "2 1 ny"]:
 
 
 def _factors(record: Record) -> Float[Array, "m ny"]:
-    """Factors of the errors, or of their spectrum by ``rfft``."""
+    """Factors on the errors, or on their spectrum by ``rfft``."""
     T, ny = record.y.shape
     if record.line_weight is None:
         return record.factors
-    # Parseval: Σ e² = Σ |E|² / T over all T lines; those between 0 and fs / 2 stand for two.
+    # Parseval: Σ e² = Σ |E|² / T over all T lines; each line between 0 and fs / 2 counts twice.
     twice = np.full((T // 2 + 1, 1), 2.0)
     twice[0] = 1.0
     if T % 2 == 0:
@@ -157,5 +157,5 @@ def _factors(record: Record) -> Float[Array, "m ny"]:
 
 
 def _columns(weight: Float[Tensor, "R m ny"], like: Tensor) -> Tensor:
-    """The weight with as many axes as what it multiplies."""
+    """The weight with as many axes as the tensor that it multiplies."""
     return weight.reshape(*weight.shape, *[1] * (like.ndim - weight.ndim))

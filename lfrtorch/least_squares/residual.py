@@ -1,4 +1,4 @@
-"""A residual r(θ) and its Jacobian, as far as a search needs them."""
+"""Interfaces of a residual r(θ) and its Jacobian, as a search uses them."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from lfrtorch.least_squares.linear_systems import System
 
 
 class Jacobian(Protocol):
-    """The Jacobian J of a residual r, as far as the search needs it: never the whole matrix."""
+    """The Jacobian J of a residual r; a search never needs the whole matrix."""
 
     def system(self, damping: float, truncation: float) -> tuple[System, Float[Tensor, " P"]]:
         """The system (JᵀJ + λI) δ = -gradient, and the gradient Jᵀr."""
-        # ``damping`` is about λ of the next trial relative to the largest eigenvalue of JᵀJ; errors
-        # of the system may be a small part of it. Singular values below ``truncation`` of the
-        # largest are left out.
+        # ``damping`` is approximately λ of the next trial, relative to the largest eigenvalue of
+        # JᵀJ; errors of the system may be a small part of it. Singular values below ``truncation``
+        # times the largest are left out.
         ...
 
     def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
@@ -30,13 +30,13 @@ class Jacobian(Protocol):
 
 
 class Point(NamedTuple):
-    """A θ and what a problem found there.
+    """A θ and a problem's evaluation there.
 
     Args:
         theta: θ (P,).
         residual: r (M,).
         cost: |r|².
-        seen: further values for derivatives there, as trajectories: tuples of tensors.
+        seen: further values that derivatives need, such as trajectories: tuples of tensors.
     """
 
     theta: Tensor
@@ -48,8 +48,8 @@ class Point(NamedTuple):
 class LeastSquares(Protocol):
     """A residual and its Jacobian. A residual that is undefined is infinite or NaN."""
 
-    # A simple problem has ``residual`` and ``linearise``. One that keeps more of a θ than r has
-    # ``evaluate`` and ``linearise_at``.
+    # A simple problem defines ``residual`` and ``linearise``. A problem that keeps more than r at a
+    # θ defines ``evaluate`` and ``linearise_at``.
 
     def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """r at θ."""
@@ -60,7 +60,7 @@ class LeastSquares(Protocol):
         ...
 
     def evaluate(self, theta: Float[Tensor, " P"], near: Point | None = None) -> Point:
-        """r at θ; ``near`` is a point close by."""
+        """r at θ; ``near`` is a nearby point."""
         residual = self.residual(theta)
         return Point(theta, residual, self.cost(residual))
 
@@ -73,5 +73,5 @@ class LeastSquares(Protocol):
         return float(residual @ residual)
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
-        """θ, or one near it that the search may go to."""
+        """θ, or the nearby θ that the search may use in its place."""
         return theta

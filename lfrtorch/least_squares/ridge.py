@@ -1,4 +1,4 @@
-"""A ridge: the penalty on parameters that leave where the search began."""
+"""A ridge: the penalty on the distance of parameters to their start."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.least_squares.term import PenaltyRows, Seen, Term
 
 Ridge = float | Mapping[str, float]
-"""One number, or one for each group of parameters by the beginning of their names,
-``{"static": 1e-3, "A": 1e-2, "x0": 0}``; other groups get 0."""
+"""One number, or a number for each group of parameters whose names begin alike,
+``{"static": 1e-3, "A": 1e-2, "x0": 0}``; other parameters get 0."""
 
 LARGEST_RIDGE = 1e100
-"""Largest ridge: its square does not overflow."""
+"""Largest ridge, whose square does not overflow."""
 
 
 class RidgePenalty(Term):
     """A term of a problem: √ridge (θ - θ_0)."""
 
-    # A prior on each parameter: the ridge is noise variance over prior variance, both normalised.
+    # The ridge is a prior on each parameter: noise variance over prior variance, both normalised.
 
     def __init__(self, ridge: Float[Tensor, " P"], theta_0: Float[Tensor, " P"]) -> None:
         self._root, self._theta_0 = ridge.to(theta_0).sqrt(), theta_0
@@ -39,7 +39,7 @@ class RidgePenalty(Term):
         return [PenaltyRows(self._root, self._root * (theta - self._theta_0))]
 
     def part(self, count: int) -> RidgePenalty:
-        """The penalty beside one of so many parts of the data."""
+        """The share of the penalty for one of ``count`` parts of the data."""
         return RidgePenalty(self._root.square() / count, self._theta_0)
 
 
@@ -50,11 +50,11 @@ def ridge_by_entry(ridge: Ridge, sizes: Mapping[str, int]) -> Float[Tensor, " P"
         name = f"ridge of '{group}'" if group else "ridge"
         number(name, value)
         if value > LARGEST_RIDGE:
-            raise InputError(f"{name} is {value}; give {LARGEST_RIDGE} at most.")
+            raise InputError(f"{name} is {value}; give at most {LARGEST_RIDGE}.")
         own = [each for each in sizes if not group or f"{each}.".startswith(f"{group}.")]
         if group and not own:
             raise InputError(
-                f"ridge has a group '{group}', and no parameter's name begins so; "
+                f"ridge has a group '{group}', but no parameter's name begins with it; "
                 f"the parameters are {', '.join(sizes)}."
             )
         weights |= dict.fromkeys(own, float(value))

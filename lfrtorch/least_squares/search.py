@@ -1,6 +1,6 @@
-"""A search of the minimum of a problem: the only caller of the optimisers.
+"""A search for the minimum of a problem: the only caller of the optimisers.
 
-Its state is a value, so that to go on is to have kept it.
+The state of a search is a plain value. Whoever keeps it can continue the search later.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from torch import Tensor
 from lfrtorch._support.reasons import Reason
 
 STRIDE = 4
-"""Iterations over which a search is seen to have settled."""
+"""Number of iterations over which ``advance`` measures the decrease of the cost."""
 
 
 class Search:
-    """A problem and the optimiser that searches its minimum.
+    """A problem and the optimiser that searches for its minimum.
 
     Args:
         problem: problem to minimise.
-        optimiser: ``LevenbergMarquardt``, ``Adam``, or another with ``init`` and ``step``.
-        state: where it stands. Default: ``begin`` says.
+        optimiser: ``LevenbergMarquardt``, ``Adam``, or another object with ``init`` and ``step``.
+        state: state of the search. Default: ``begin`` sets it.
     """
 
     def __init__(self, problem: Any, optimiser: Any, state: Any = None) -> None:
         self.problem, self.optimiser, self.state = problem, optimiser, state
 
     def begin(self, theta: Tensor, point: Any = None) -> Any:
-        """The state at θ, and what was found there if it is known."""
+        """The state at θ; ``point`` is the evaluation there, if it is known."""
         self.state = self.optimiser.init(self.problem, theta, point)
         return self.state
 
@@ -44,9 +44,10 @@ class Search:
         settled: float = 0.0,
         check: Callable[[], None] = lambda: None,
     ) -> Self:
-        """Go on to an iteration, or until the cost no longer falls; ``check`` may raise before one.
+        """Iterate up to ``until``, or until the cost no longer falls.
 
-        It has ``settled``, too, if STRIDE iterations lower it by less than that part.
+        ``check`` is called before each iteration, and may raise. The search also ends if STRIDE
+        iterations lower the cost by less than the fraction ``settled``.
         """
         costs = [self.state.cost]
         while not self.state.reason and self.state.iteration < until:
@@ -58,5 +59,5 @@ class Search:
 
     @property
     def reason(self) -> str:
-        """Why it ended."""
+        """Why the search ended."""
         return self.state.reason or Reason.ALL_ITERATIONS

@@ -1,7 +1,7 @@
-"""A problem whose records several processes share, each the residual of its own.
+"""A problem whose records several processes share; each computes the residual of its own records.
 
-All of them have the same θ, cost, gradient and steps: sums go over all processes, and what rounding
-errors decide is the first one's.
+All processes have the same θ, cost, gradient and steps: sums go over all processes, and where
+rounding errors matter, the numbers of the first process are used.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def problem_of(model: Model, records: Record | Sequence[Record], **options: Any) -> Problem:
-    """The problem of the processes that work together now, see ``Problem.of``."""
+    """The problem of the processes that work together now; see ``Problem.of``."""
     kind = SharedProblem if current().world > 1 else Problem
     return kind.of(model, records, **options)
 
@@ -43,12 +43,12 @@ class SharedProblem(Problem):
 
     @classmethod
     def _share(cls, model: Model, records: Sequence[Record]) -> slice:
-        """The records of this process; all begin with the weights of the first one's model."""
+        """The records of this process; its model gets the weights of the first process's model."""
         ranks = current()
         if len(records) < ranks.world:
             raise InputError(
-                f"{ranks.world} processes share {len(records)} record(s); each needs one: start "
-                "fewer processes, or cut the data into more records."
+                f"{ranks.world} processes share {len(records)} record(s), but each needs one; "
+                "start fewer processes, or cut the data into more records."
             )
         same_weights([model])
         return slice(ranks.rank, None, ranks.world)
@@ -62,12 +62,12 @@ class SharedProblem(Problem):
         return self._ranks.first(part)
 
     def of_own_records(self, state: Any) -> Any:
-        """A search's state with the residual of the records that this process has."""
+        """A search's state with the residual of this process's records."""
         point = self.evaluate(state.theta)
         return replace(state, residual=point.residual, seen=point.seen)
 
     def weigh(self, ridge: Ridge) -> None:
-        """Give the ridge another weight; the first process has its rows."""
+        """Give the ridge another weight; only the first process has the rows of the ridge."""
         super().weigh(ridge if self._ranks.rank == 0 else 0.0)
 
     def _first_theta(self) -> Float[Tensor, " P"]:
@@ -79,14 +79,14 @@ class SharedProblem(Problem):
 
 
 class _SharedJacobian(Jacobian):
-    """The rows of all processes, of which each has some."""
+    """The Jacobian of all records; each process has the rows of its own records."""
 
     def __init__(self, *parts: Any, ranks: Ranks) -> None:
         super().__init__(*parts)
         self._ranks = ranks
 
     def system(self, damping: float, truncation: float) -> tuple[System, Float[Tensor, " P"]]:
-        """The least-squares system of J and its gradient, as the first process has them."""
+        """The least-squares system of J and its gradient, as the first process computes them."""
         system, gradient = super().system(damping, truncation)
         return BroadcastSystem(system, self._ranks), self._ranks.first(gradient)
 
@@ -102,7 +102,7 @@ class _SharedJacobian(Jacobian):
 
 
 class BroadcastSystem:
-    """A system that the first process solves for all: each has its own rounding errors."""
+    """A system that the first process solves for all, so that all have its rounding errors."""
 
     def __init__(self, system: System, ranks: Ranks) -> None:
         self._system, self._ranks = system, ranks
@@ -124,7 +124,7 @@ class BroadcastSystem:
 
 @torch.no_grad()
 def same_weights(models: Sequence[Model]) -> None:
-    """Give all processes that work together the weights of the first one's models."""
+    """Give all processes that work together the weights of the first process's models."""
     for model in models if current().world > 1 else ():
         for p in model.lfr.parameters():
             p.copy_(current().first(p.detach()))

@@ -1,4 +1,4 @@
-"""The errors that a fit is about: simulated minus measured outputs of groups of records."""
+"""The errors that a fit minimises: simulated minus measured outputs of groups of records."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from lfrtorch.least_squares.term import Seen
 
 
 class Parameters:
-    """θ: the free numbers of a model in their order, then initial states of records."""
+    """θ: the free numbers of a model in their order, then the initial states of records."""
 
-    # On the CPU θ and all that is computed from it are float64, whatever the cell is.
+    # On the CPU θ and all numbers computed from it are float64, whatever the dtype of the cell.
 
     def __init__(self, cell: LFRCell, states: int) -> None:
         W = cell.weights()
@@ -35,14 +35,14 @@ class Parameters:
         self.own = len(self._free)
         """Number of entries before the initial states."""
         self.sizes = {n: p.numel() for n, p in cell.named_parameters() if p.requires_grad}
-        """Entries of each parameter, and of the initial states if there are any."""
+        """Number of entries of each parameter, and of the initial states if there are any."""
         self.names = list(self.sizes)
         if states:
             self.sizes["x0"] = states * cell.nx
 
     @property
     def start(self) -> Float[Tensor, " own"]:
-        """θ of the cell that was given, without initial states."""
+        """θ of the given cell, without initial states."""
         return self._flat[self._free]
 
     def weights(self, theta: Float[Tensor, " P"]) -> Weights:
@@ -72,11 +72,11 @@ class Parameters:
 
 
 class SimulationErrors:
-    """A term of a problem: weighted y_hat - y, normalised; 0 where a sample does not count."""
+    """A term of a problem: weighted, normalised y_hat - y; 0 where a sample does not count."""
 
-    # ``own``: which of the records have errors; start states in θ are those of all.
-    # ``solve_initial_states``: estimated initial states are no part of θ, but solved for at every
-    # θ, and outputs end at the limits of a record, as in a score.
+    # ``own`` selects the records that have errors here; θ has the start states of all records.
+    # ``solve_initial_states``: estimated initial states are not part of θ, but are solved for at
+    # every θ, and outputs are clipped to the limits of a record, as in a score.
 
     def __init__(
         self,
@@ -108,7 +108,7 @@ class SimulationErrors:
     def linearise(
         self, theta: Float[Tensor, " P"], seen: Seen, *, eliminate: bool = False
     ) -> list[OutputRows]:
-        """The rows of each group at θ; ``eliminate``: without columns of initial states."""
+        """The rows of each group at θ; ``eliminate`` leaves out the columns of initial states."""
         W, own, rows = self.parameters.weights(theta), self.parameters.own, []
         for group, trajectory in zip(self.groups, seen, strict=True):
             x0 = group.estimated if self.parameters.states else None
@@ -129,7 +129,7 @@ class SimulationErrors:
         return total
 
     def _simulated(self, theta: Float[Tensor, " P"], near: Seen | None) -> tuple[Trajectory, ...]:
-        """The trajectory of each group at θ, from the states near it."""
+        """The trajectory of each group at θ; ``near`` has trajectories at a nearby θ."""
         W, found = self.parameters.weights(theta), []
         for i, group in enumerate(self.groups):
             states = near[i].x if near is not None and fast_paths() else None
@@ -152,7 +152,7 @@ class SimulationErrors:
         return found
 
     def first_theta(self) -> Float[Tensor, " P"]:
-        """θ of the cell that was given, with the initial states that fit best."""
+        """θ of the given cell, with the initial states that fit best."""
         start = self.parameters.start
         W, count = self.parameters.weights(start), self.parameters.states
         states = start.new_zeros(count, W.nx)

@@ -1,9 +1,9 @@
-"""States that fade: a fit that keeps the eigenvalues of A within the unit circle.
+"""The guarantee of stable states: a fit that keeps the eigenvalues of A within the unit circle.
 
 If all eigenvalues of A are inside the unit circle and the static map is bounded, no bounded input
 makes the model run away: x is the response of a stable linear system to u and w. Exact integrators
-stay as they are. A step of a search is held within the limit to first order, at the least cost
-(``PoleBounds``); what it passes the limit by to second order is taken back (``stabilised``).
+do not change. A step of a search keeps the limit to first order, at the least cost
+(``PoleBounds``); an excess of second order is then corrected (``stabilised``).
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from lfrtorch.least_squares.linear_systems import System
 
 
 def largest_modulus(samples: int) -> float:
-    """Largest modulus of an eigenvalue that fades to 1/e within a record of so many samples."""
+    """Largest modulus of an eigenvalue whose response decays to 1/e within a number of samples."""
     return 1.0 - 1.0 / samples
 
 
 NEAR = 0.9
-"""Moduli below this part of the limit are left out of a step's bounds: no step goes so far, and
-eigenvalues at 0, those of delays, have no derivative."""
+"""Eigenvalues with a modulus below this part of the limit do not bound a step: no step moves them
+that far, and eigenvalues at 0, as of delays, have no derivative."""
 
 
 _NEWTON = 10
-"""Steps of Newton's method for the least change; three are enough after a step of a search."""
+"""Largest number of Newton steps to the least change; after a step of a search three are enough."""
 
 
 def fading(A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"]) -> Float[Tensor, "n n"]:
@@ -46,8 +46,8 @@ def stabilised(
     A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"], limit: float
 ) -> Float[Tensor, "nx nx"]:
     """A with each eigenvalue of a modulus above the limit scaled to it."""
-    # In A = Q T Qᵀ, the real Schur form, the blocks of these eigenvalues on the diagonal are
-    # scaled, and nothing else changes. Exact integrators stay.
+    # In the real Schur form A = Q T Qᵀ, the diagonal blocks of these eigenvalues are scaled, and
+    # nothing else changes. Exact integrators do not change.
     own = fading(A, integrating)
     if spectral_radius(own) <= limit:
         return A
@@ -70,7 +70,7 @@ def within(
     held: Bool[Tensor, "nx nx"],
     limit: float,
 ) -> Float[Tensor, "nx nx"]:
-    """A with the least change of entries that are not held that brings its eigenvalues within."""
+    """A with its eigenvalues brought within the limit, by the least change of its free entries."""
     for _ in range(_NEWTON):
         bounds = PoleBounds(A, integrating, limit)
         beyond = bounds.room < 0
@@ -83,10 +83,10 @@ def within(
 
 
 class Stable:
-    """Constraint of a search: states that fade within a record, by the eigenvalues of A."""
+    """The guarantee that states decay within a record, by the eigenvalues of A."""
 
-    # If they are not within the unit circle at the start, they stay within the circle that they are
-    # in.
+    # Eigenvalues that are outside the limit at the start stay within the smallest circle that has
+    # all of them at the start.
 
     def __init__(self, cell: LFRCell, samples: int) -> None:
         self._nx, self._integrating = cell.nx, integrating_states(cell)
@@ -107,7 +107,7 @@ class Stable:
         return theta if found is A else torch.cat([found.flatten(), theta[self._nx**2 :]])
 
     def bounded(self, theta: Float[Tensor, " P"], system: System) -> System:
-        """The system of steps from θ that keep A's eigenvalues within the limit."""
+        """The system whose steps from θ keep A's eigenvalues within the limit."""
         bounds = PoleBounds(self._matrix(theta), self._integrating, self._limit)
         return BoundedSystem(system, bounds)
 
@@ -130,7 +130,7 @@ class PoleBounds:
         near = np.flatnonzero((np.imag(values) >= 0) & (np.abs(values) > NEAR * limit))
         self._values = values[near]
         slopes = np.zeros((len(near), len(A), len(A)), complex)
-        # dλ = leftᴴ dA right / leftᴴ right; d|λ| is its part along λ.
+        # dλ = leftᴴ dA right / leftᴴ right, and d|λ| is the part of dλ along λ.
         for slope, i in zip(slopes, near, strict=True):
             y, x = np.conj(left[:, i]), right[:, i]
             slope[np.ix_(self._own, self._own)] = np.outer(y, x) / (y @ x)

@@ -1,12 +1,13 @@
-"""Start states that are parameters: each is eliminated from its own record.
+"""Elimination of start states that are parameters, each from the rows of its own record.
 
-In θ = (φ, x0 of record 1, x0 of record 2, ...) each record sees φ and its own start state. So
-JᵀJ + λI has entries between φ and everything else alone, and with A and B, the columns of φ and of
-x0 in the rows of a record, every x0 follows from φ: a system in φ is left, whose size does not
-grow with the number of records. That of all of θ takes time with the cube of it.
+In θ = (φ, x0 of record 1, x0 of record 2, ...) each record depends on φ and its own start state.
+So JᵀJ + λI couples every start state with φ alone, and every x0 follows from φ. A system in φ is
+left, whose size does not grow with the number of records; the time to solve for all of θ would grow
+with the cube of that number.
 
-Let B = U s Vᵀ: the start states leave A - U (Uᵀ A) of the rows for φ at λ = 0. A damping λ keeps
-them from following φ all the way, and λ / (s² + λ) of each row of Uᵀ A remains.
+Let A and B be the columns of φ and of x0 in the rows of a record, and B = U s Vᵀ. At λ = 0 the
+rows for φ are A - U (Uᵀ A) after the elimination. A damping λ keeps the start states from following
+φ completely, so the part λ / (s² + λ) of each row of Uᵀ A remains.
 
 References:
     Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares problems
@@ -34,9 +35,10 @@ from lfrtorch.least_squares.linear_systems import (
 
 
 class StartStates(NamedTuple):
-    """Information of the rows of records on their start states, in the coordinates Vᵀ x0."""
+    """Equations of the start states of records, in the coordinates Vᵀ x0."""
 
-    # B = U s Vᵀ; A and r are Uᵀ A and Uᵀ r; ``place`` is where each start state stands in θ.
+    # With B = U s Vᵀ, the fields A and r are Uᵀ A and Uᵀ r; ``place`` has the places of each start
+    # state in θ.
 
     place: Int[Tensor, "R nx"]
     s: Float[Tensor, "R nx"]
@@ -46,7 +48,7 @@ class StartStates(NamedTuple):
 
 
 class Eliminator:
-    """Folds the rows [A r] of φ that the start states leave into an accumulator."""
+    """Adds the rows [A r] that are left after the elimination to an accumulator."""
 
     def __init__(
         self,
@@ -59,7 +61,7 @@ class Eliminator:
         self._begun: list[QRAccumulator] = []
 
     def fold(self, rows: Float[Tensor, "R m columns"], time: slice) -> None:
-        """Add rows [A B r] of some records at some samples; records come one after another."""
+        """Add rows [A B r] of some records at some samples, one record after another."""
         if time.start == 0 and time.stop == self._samples:
             self._eliminate(rows)
             return
@@ -71,7 +73,7 @@ class Eliminator:
             self._eliminate(torch.stack([begun.R for begun in self._begun]))
 
     def found(self) -> StartStates:
-        """Those of all records."""
+        """The equations of the start states of all records."""
         s, Vh, A, r = (torch.cat(parts) for parts in zip(*self._found, strict=True))
         return StartStates(self._place.to(s.device), s, Vh, A, r)
 
@@ -84,9 +86,9 @@ class Eliminator:
             rows, B = torch.full_like(rows, torch.nan), torch.zeros_like(B)
         U, s, Vh = torch.linalg.svd(B, full_matrices=False)
         seen = _products(U.mT, rows)
-        # Of B nothing is left, so that its columns may stay among the others.
+        # The columns of B become zero, so they may stay among the others.
         part = type(self._total)()
-        if isinstance(part, GramAccumulator):  # a difference loses no more digits than products do
+        if isinstance(part, GramAccumulator):  # a difference of products loses no further digits
             part.fold(rows.flatten(0, 1))
             part.add(-product(seen.flatten(0, 1).mT, seen.flatten(0, 1)))
         else:
@@ -98,17 +100,17 @@ class Eliminator:
 
 
 def _products(left: Float[Tensor, "R m k"], right: Float[Tensor, "R k n"]) -> Tensor:
-    """Products of small matrices, by numpy on the CPU: three times faster for many."""
+    """Products of small matrices, on the CPU by numpy, which is three times faster for many."""
     if not has_kernels(left):
         return left @ right
     return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))
 
 
 class EliminatedSystem:
-    """The system of φ and start states, from what is left in φ."""
+    """The system of φ and start states, from the system in φ that the elimination leaves."""
 
-    # ``left`` is GramAccumulator's matrix (``gram``) or QRAccumulator's factor. The ridge is the
-    # same for all start states.
+    # ``left`` is the matrix of a GramAccumulator (``gram``), or the factor of a QRAccumulator. The
+    # ridge is the same for all start states.
 
     def __init__(
         self,
@@ -127,7 +129,7 @@ class EliminatedSystem:
         self._latest: tuple[float, SVDSystem | Tensor] | None = None
         whole = (left if gram else left.mT @ left) + self._A.mT @ self._A + self._ridge.diag()
         self._whole, self.rank = whole, P + states.s.numel()
-        # JᵀJ's largest eigenvalue is at most that of φ's block plus that of the states'.
+        # The largest eigenvalue of JᵀJ is at most that of φ's block plus that of the states' block.
         self._largest = float(states.s.square().max()) + self._own
         self.size = max(float(torch.linalg.matrix_norm(whole)), self._largest)
 
@@ -152,7 +154,7 @@ class EliminatedSystem:
         return found
 
     def _shared_step(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
-        """That of φ."""
+        """The part of the step in φ."""
         if self._latest is None or self._latest[0] != damping:
             self._latest = damping, self._decomposed(damping)
         found = self._latest[1]
@@ -161,7 +163,7 @@ class EliminatedSystem:
         return -torch.cholesky_solve(gradient.unsqueeze(-1), found).squeeze(-1)
 
     def _decomposed(self, damping: float) -> SVDSystem | Tensor:
-        """A decomposition of what is left for φ at that damping."""
+        """A decomposition of the system in φ at that damping."""
         squares, extra = self._states.s.square().flatten(), self._own + damping
         rest = (extra / (squares + extra)).sqrt().unsqueeze(1) * self._A
         if not self._gram:

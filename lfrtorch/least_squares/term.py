@@ -1,4 +1,4 @@
-"""A term: one summand |r(θ)|² of a problem, and the rows that it has in the Jacobian."""
+"""A term: one summand |r(θ)|² of a problem, and its rows of the Jacobian."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator
 from lfrtorch.least_squares.start_states import StartStates
 
 Seen = tuple[Any, ...]
-"""Values of a term at a θ, about which it linearises: tuples of tensors, as trajectories."""
+"""Values of a term at a θ that its linearisation needs, such as trajectories: tuples of tensors."""
 
 
 class Term(Protocol):
     """One summand |r(θ)|² of a problem."""
 
     def evaluate(self, theta: Float[Tensor, " P"], near: Seen | None = None) -> tuple[Tensor, Seen]:
-        """r at θ, infinite or NaN where it is undefined, and what else is known there.
+        """r at θ, infinite or NaN where it is undefined, and the values that ``linearise`` needs.
 
-        ``near`` is what was seen at a θ close by, which may save time.
+        ``near`` has these values at a nearby θ, which may save time.
         """
         ...
 
     def linearise(
         self, theta: Float[Tensor, " P"], seen: Seen, *, eliminate: bool
     ) -> Sequence[TermRows | PenaltyRows]:
-        """The rows of dr/dθ at θ; ``eliminate``: initial states are eliminated from them."""
+        """The rows of dr/dθ at θ; with ``eliminate``, initial states are eliminated from them."""
         ...
 
     def release(self) -> None:
@@ -37,7 +37,7 @@ class Term(Protocol):
 
 
 class TermRows(Protocol):
-    """Some rows of J, weighted, and the residual there; gauge directions leave them as they are."""
+    """Some weighted rows of J and their residual; gauge directions do not change this residual."""
 
     count: int
     """Number of rows."""
@@ -48,13 +48,13 @@ class TermRows(Protocol):
     def fold(
         self, kept: Int[Tensor, " K"], total: QRAccumulator | GramAccumulator, room: int
     ) -> int:
-        """Add the rows [J r] in the kept columns; bytes cached, which are at most ``room``."""
+        """Add the rows [J r] in the kept columns; return the bytes cached, up to ``room``."""
         ...
 
     def tangent(
         self, d_theta: Float[Tensor, " P"], reduced: Float[Tensor, " K"]
     ) -> Float[Tensor, " count"]:
-        """J dθ; the change is given in the kept columns, too."""
+        """J dθ; ``reduced`` is dθ in the kept columns."""
         ...
 
     def adjoint(
@@ -63,7 +63,7 @@ class TermRows(Protocol):
         gradient: Float[Tensor, " P"],
         reduced: Float[Tensor, " K"],
     ) -> None:
-        """Add Jᵀ residual to the gradient, or to the one in the kept columns."""
+        """Add Jᵀ residual to the gradient, or to ``reduced``, the gradient in the kept columns."""
         ...
 
     def whole(self, parameters: int) -> Float[Tensor, "count P"]:
@@ -72,9 +72,9 @@ class TermRows(Protocol):
 
 
 class PenaltyRows:
-    """A diagonal of J: each row sees one entry of θ, so a gauge direction does change it."""
+    """A diagonal part of J: each row depends on one entry of θ, so gauge directions change it."""
 
-    # If initial states are eliminated, all of them have the same factor.
+    # If initial states are eliminated, all of them have the same factor on the diagonal.
 
     def __init__(self, diagonal: Float[Tensor, " P"], residual: Float[Tensor, " P"]) -> None:
         self.diagonal, self.residual, self.count = diagonal, residual, len(diagonal)
