@@ -1,7 +1,8 @@
 """Proofs about a model: that it contracts, and bounds of its signals.
 
-No other room imports this one: a fit loads it for ``guarantee="contracting"``, and ``analysis``
-with the first use. Certificates need clarabel: pip install 'lfrtorch[certificate]'.
+No other package imports this one at its start: a fit loads it for ``guarantee="contracting"``, and
+``analysis`` loads it at its first use. Certificates need clarabel: pip install
+'lfrtorch[certificate]'.
 """
 
 from lfrtorch.guarantees.bounds import Bound, bound

@@ -1,16 +1,17 @@
-"""Proven bounds of states and outputs for all inputs of an amplitude.
+"""Proven bounds of states and outputs, for all inputs up to an amplitude.
 
-x is the response of a stable linear system to u and w. About their middles, with A x̄ + Bw w̄ = x̄::
+x is the response of a stable linear system to u and w. Let δu and δw be the deviations of u and w
+from the middles 0 and w̄ of their ranges, and A x̄ + Bw w̄ = x̄. Then::
 
     x(k) = x̄ + Aᵏ (x(0) - x̄) + Σ_j<k Aʲ (Bu δu(k-1-j) + Bw δw(k-1-j))
 
-so that |δu| <= r brings any row c of it no further than Σ_j |c Aʲ Bu| r, the sum of the impulse
-response's moduli; likewise w, as the map is bounded. That bounds z, which bounds w more tightly,
-and so on. The loop is closed through K of w = K z + δw as soon as z is bounded: then the
-rest of the map is small, and so are the bounds.
+For |δu| <= r the input moves c x, for any row c, by at most Σ_j |c Aʲ Bu| r: the absolute sum of
+the impulse response times r. The same holds for w, as the static map is bounded. That bounds z,
+which bounds w more tightly, and so on. Once z is bounded, w = K z + δw and the loop is closed
+through K: then only the small rest δw of the map adds to the bounds.
 
-The sums end after N samples. The rest of them is at most |M| (I - |M|)⁻¹, M = Aᴺ, times the sums
-of the states, entry by entry.
+The sums are cut after N samples. Entry by entry, their rest is at most |M| (I - |M|)⁻¹ times the
+sums of the states, where M = Aᴺ.
 
 References:
     Dahleh and Diaz-Bobillo, "Control of Uncertain Systems: A Linear Programming Approach", Prentice
@@ -41,24 +42,25 @@ from lfrtorch.maps.enclosure import Enclosure, Interval, everywhere
 from lfrtorch.model.model import Model
 
 _LONGEST = 2**16
-"""Most samples of an impulse response that are summed; slower ones have a looser bound."""
+"""Largest number of samples of an impulse response that are summed; slower responses get a looser
+bound."""
 
 _REST = 1e-4
-"""The rest of the sums is below this part of the states' rms, or they have ``_LONGEST`` samples."""
+"""The sums end when their rest is below this part of the states' rms, or after ``_LONGEST``."""
 
 _BLOCK = 256
-"""Samples of impulse responses that are computed together."""
+"""Number of samples of impulse responses that are computed together."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """Proven bounds, up to rounding errors; ``print(bound)`` shows those of the outputs.
+    """Proven bounds, up to rounding errors; ``print(bound)`` shows the bounds of the outputs.
 
     Args:
         amplitude: amplitude of the inputs, (nu,), physical units: the bound of |u - offset|.
         y: lowest and highest value of each output, (ny, 2), physical units.
-        x, z, w: the same of states and of the static map's signals, in the model's coordinates,
-            as in ``model.signals(record)``.
+        x, z, w: lowest and highest values of states and of the static map's signals, in the
+            model's coordinates, as in ``model.signals(record)``.
         inputs, outputs: channel names and units.
 
     Example:
@@ -90,13 +92,13 @@ class Bound:
 
 @typed()
 def bound(model: Model, amplitude: ArrayLike, *, x0: ArrayLike | None = None) -> Bound:
-    """Bounds of the states and outputs of a model, for all inputs of an amplitude.
+    """Bounds of the states and outputs of a model, for all inputs up to an amplitude.
 
-    It is reached by the worst input of a linear model, and may be far from that of a nonlinear one.
-    The mathematics stand at the head of ``lfrtorch/guarantees/bounds.py``.
+    The worst input of a linear model reaches its bound; a nonlinear model may stay far within it.
+    The docstring of ``lfrtorch/guarantees/bounds.py`` derives the bounds.
 
     Args:
-        model: a model with a stable A, and a network of tanh, sigmoid or rbf; or linear.
+        model: a model with a stable A: a linear one, or one with a tanh, sigmoid or rbf network.
         amplitude: largest |u - offset|, physical units; the offsets are those of the model.
         x0: initial state in the model's coordinates. Default: 0.
 
@@ -104,7 +106,7 @@ def bound(model: Model, amplitude: ArrayLike, *, x0: ArrayLike | None = None) ->
         amplitude: (nu,) or a number for all inputs, x0: (nx,).
 
     Raises:
-        ValueError: A is not stable, or the static map not bounded: the bound would be infinite.
+        ValueError: A is not stable or the static map is not bounded, so the bound is infinite.
 
     Example:
         >>> bound = lfrtorch.analysis.bound(model, amplitude=0.5)
@@ -130,15 +132,15 @@ def amplitudes(given: ArrayLike, nu: int) -> Array:
     found = np.atleast_1d(reals("amplitude", given))
     if found.shape not in ((1,), (nu,)) or not (np.isfinite(found) & (found >= 0)).all():
         raise InputError(
-            f"amplitude is {given!r}; the model has {nu} input(s): give one finite number for all, "
-            "or one for each, in physical units and not negative."
+            f"amplitude is {given!r}; give one number for all {nu} input(s) or a number for each, "
+            "in physical units, finite and not negative."
         )
     return np.broadcast_to(found, nu).copy()
 
 
 @dataclass(frozen=True, eq=False)
 class _Reach:
-    """Bounds of all signals, normalised, and what the static map does in them."""
+    """Bounds of all signals, normalised, and the enclosure of the static map within them."""
 
     x: Interval
     y: Interval
@@ -172,7 +174,7 @@ def reach(cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]
                 break
             there = inside(found, K)
         before, found = found, found.within(loop.bounds(K, there.w))
-        if (found.radius >= 0.99 * before.radius).all():  # a round shrinks none
+        if (found.radius >= 0.99 * before.radius).all():  # this round has tightened no bound
             if closed:
                 break
             closed = True
@@ -182,9 +184,9 @@ def reach(cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]
 
 
 class _Loop:
-    """The linear part of a model with the rows that are bounded.
+    """The linear part of a model, with rows for the signals to be bounded.
 
-    These are x, y, z and, if nz > 1, the inputs of neurons.
+    The signals are x, y, z and, if nz > 1, the inputs of neurons.
     """
 
     def __init__(
@@ -198,7 +200,7 @@ class _Loop:
         self.A, self.Bu, self.Bw, self.Cz, self.Dzu = A, Bu, Bw, Cz, Dzu
         self._amplitude, self._x0 = amplitude, x0
         Wz = np.zeros((0, cell.nz))
-        if anywhere is not None and anywhere.neurons and cell.nz > 1:  # one z bounds them itself
+        if anywhere is not None and anywhere.neurons and cell.nz > 1:  # a single z bounds them
             Wz = to_float64(anywhere.neurons[2])
         self.C = np.concatenate([np.eye(cell.nx), Cy, Cz, Wz @ Cz])
         self.Du = np.concatenate([np.zeros((cell.nx, cell.nu)), Dyu, Dzu, Wz @ Dzu])
@@ -207,7 +209,7 @@ class _Loop:
         self._ends = np.cumsum([cell.nx, cell.ny, cell.nz])
 
     def signals(self, rows: Interval) -> tuple[Interval, Interval, Interval, Interval | None]:
-        """Bounds of x, y, z and inputs of neurons; None without the last."""
+        """Bounds of x, y, z and inputs of neurons; None in place of the last if there are none."""
         low, high = (np.split(side, self._ends) for side in rows)
         x, y, z, a = (Interval(*pair) for pair in zip(low, high, strict=True))
         return x, y, z, (a if len(a.low) else None)
@@ -254,7 +256,7 @@ def _moved(
         high = np.maximum(high, (free + before).max(axis=0))
         spread, X = after[-1], over_block @ X
         farthest = np.maximum(farthest, np.abs(free[:, :nx]).max(axis=0))
-    # What comes later, entry by entry.
+    # Bounds on the samples after the last summed one, entry by entry.
     M = np.abs(np.linalg.matrix_power(A, samples))
     power, states, later = np.linalg.matrix_power(A, samples), spread[:nx], np.zeros(nx)
     while (rest := _rest(M)) is None:
@@ -270,7 +272,7 @@ def _moved(
 
 
 def _samples(A: Float[Array, "nx nx"], B: Float[Array, "nx n"]) -> int:
-    """Samples, a power of 2, after which little is left of the impulse responses."""
+    """Number of samples, a power of 2, after which impulse responses have nearly decayed."""
     samples, power, gramian = 1, A, B @ B.T
     while samples < _LONGEST:
         rms = np.sqrt(gramian.diagonal())
@@ -283,7 +285,7 @@ def _samples(A: Float[Array, "nx nx"], B: Float[Array, "nx n"]) -> int:
 
 
 def _rest(M: Float[Array, "nx nx"]) -> Float[Array, "nx nx"] | None:
-    """M + M² + .. = M (I - M)⁻¹ for M >= 0, or None: some q > 0 with M q < q proves it."""
+    """M + M² + .. = M (I - M)⁻¹ for M >= 0, proven by a q > 0 with M q < q; None without proof."""
     if not (M.sum(axis=1) < np.inf).all():
         return None
     try:
@@ -309,6 +311,6 @@ def _check(cell: LFRCell, anywhere: Enclosure | None) -> None:
     largest = float(np.abs(np.linalg.eigvals(cell.A.detach().numpy())).max())
     if largest >= 1.0:
         raise InputError(
-            f"A is not stable, |eigenvalue| {largest:.6g}: a small input may make the states grow "
-            "without bound.\nA fit with trainer.guarantee=stable keeps the eigenvalues within 1."
+            f"A has an eigenvalue of modulus {largest:.6g} and is not stable: small inputs may let "
+            "states grow without bound.\nA fit with trainer.guarantee=stable keeps the modulus < 1."
         )

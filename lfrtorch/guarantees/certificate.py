@@ -1,4 +1,4 @@
-"""Certificate that all trajectories of a model converge: one linear matrix inequality.
+"""Certificate that all trajectories of a model converge: a linear matrix inequality.
 
 The difference of two trajectories obeys a linear system with a few uncertain slopes::
 
@@ -6,17 +6,18 @@ The difference of two trajectories obeys a linear system with a few uncertain sl
     v  = C x + D u            |p_i| <= |v_i|, i = 1 .. q
     y  = Cy x + Dy p + Dyu u
 
-Let P > 0 and a diagonal T >= 0 have, for u = 0 and all other x and p::
+Suppose that P > 0 and a diagonal T >= 0 satisfy, for u = 0 and all x and p that are not both 0::
 
     |x+|²_P - ρ²|x|²_P + |v|²_T - |p|²_T < 0.
 
-The last two terms are not negative, so |x|_P shrinks by ρ in every sample. Likewise with::
+The last two terms together are not negative, so |x|_P shrinks at least by the factor ρ in every
+sample. Likewise, if for all x, p and u that are not all 0::
 
-    |x+|²_P - |x|²_P + |v|²_T - |p|²_T + |y|² - γ²|u|² < 0
+    |x+|²_P - |x|²_P + |v|²_T - |p|²_T + |y|² - γ²|u|² < 0,
 
-for all x, p and u, the sum of |y|² is at most γ² times that of |u|². Both are linear in P, T and
-γ². An interior-point method finds them. The inequality is checked afterwards with
-the eigenvalues of the matrices, so the method need not be trusted.
+the sum of |y|² is at most γ² times the sum of |u|². Both inequalities are linear in P, T and γ². An
+interior-point method solves them. Afterwards eigenvalues of the matrices check the inequality, so
+the method need not be trusted.
 
 References:
     Boyd, El Ghaoui, Feron and Balakrishnan, "Linear Matrix Inequalities in System and Control
@@ -42,24 +43,25 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.maps.enclosure import Enclosure, Interval
 
 ACCURACY = 1e-9
-"""Relative accuracy asked of the SDP solver."""
+"""Relative accuracy of the SDP solver."""
 
 ROUNDING = 10 * np.finfo(np.float64).eps
-"""Rounding error of a sum, relative to the sum of moduli times its length."""
+"""Rounding error of a sum, relative to its length times the sum of moduli."""
 
 SLOWEST = 1.0 - 1e-6
-"""A rate that counts as contraction: a million samples to shrink to 1/e."""
+"""Largest rate that counts as contraction: differences take a million samples to shrink to 1/e."""
 
 SHORTEST = 1e-9
-"""Shorter rows of C and columns of B, relative to the longest, are scaled like this one."""
+"""Rows of C and columns of B that are shorter, relative to the longest, are scaled as if they had
+this length."""
 
 LARGEST = 64
-"""Most rows of the inequality: the time of a solution grows with their sixth power."""
+"""Largest number of rows of the inequality: the solution time grows with their sixth power."""
 
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """The system above, with the slopes of neurons or of entries of ∂w/∂z."""
+    """The system of differences, whose slopes are those of neurons or entries of ∂w/∂z."""
 
     A: Float[Array, "nx nx"]
     B: Float[Array, "nx q"]
@@ -80,7 +82,7 @@ class Differences:
 
     @classmethod
     def by_entry(cls, cell: LFRCell, J: Interval) -> Differences:
-        """Each entry of J = ∂w/∂z is anywhere in its interval."""
+        """The system in which each entry of J = ∂w/∂z is anywhere in its interval."""
         i, j = np.nonzero(J.radius)
         radius = J.radius[i, j]
         return cls._about(
@@ -89,14 +91,14 @@ class Differences:
 
     @classmethod
     def by_neuron(cls, cell: LFRCell, slopes: Interval, left: Tensor, right: Tensor) -> Differences:
-        """The slope of each neuron is anywhere in its interval; J = left diag(slopes) right."""
+        """The system for J = left diag(slopes) right, with each neuron's slope in its interval."""
         Ww, Wz = to_float64(left), to_float64(right)
         J = Ww * slopes.middle @ Wz
         return replace(cls._about(cell, J, Ww, slopes.radius[:, None] * Wz), neurons=True)
 
     @classmethod
     def _about(cls, cell: LFRCell, J: Array, left: Array, right: Array) -> Differences:
-        """∂w/∂z = J + left diag(δ) right, |δ| <= 1."""
+        """The system for ∂w/∂z = J + left diag(δ) right, |δ| <= 1."""
         A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
         return cls(
             A=A + Bw @ J @ Cz,
@@ -111,7 +113,7 @@ class Differences:
 
     @classmethod
     def of(cls, cell: LFRCell, slopes: Enclosure | None) -> list[Differences]:
-        """By entry and by neuron: the smaller one, and the other if not too large."""
+        """The systems by entry and by neuron: the smaller, and the other if not too large."""
         if slopes is None:
             nothing = np.zeros((0, 0))
             return [cls.by_entry(cell, Interval(nothing, nothing))]
@@ -123,13 +125,13 @@ class Differences:
 
     @property
     def size(self) -> int:
-        """Rows of the inequality."""
+        """Number of rows of the inequality."""
         return sum(self.B.shape)
 
     def moved(
         self, L: Float[Array, "nx nx"], s: Float[Array, " q"] | None = None
     ) -> tuple[Differences, Float[Array, " q"]]:
-        """The same for L x and s v, s p; by default columns of B are then as long as rows of C."""
+        """The system for L x and s v, s p, and s; default s: columns of B as long as rows of C."""
         back = np.linalg.inv(L)
         B, C = L @ self.B, self.C @ back
         lengths = np.array([np.linalg.norm(B, axis=0), np.linalg.norm(C, axis=1)])
@@ -149,7 +151,7 @@ class Differences:
 
 
 class Certificate(NamedTuple):
-    """P and T that do what they should, as the eigenvalues of the inequality show."""
+    """P and T that satisfy the inequality, as its eigenvalues prove."""
 
     P: Float[Array, "nx nx"]
     T: Float[Array, " q"]
@@ -183,9 +185,9 @@ def margin(system: Differences, rate: float) -> Margin | None:
 
 
 def common_norm(A: Float[Array, "S nx nx"], rate: float) -> Float[Array, "nx nx"] | None:
-    """P of a norm that shrinks to the rate or less in a step by each of several A; None if none.
+    """P of a norm in which each of several A shrinks states to the rate or less; None if none.
 
-    It is the solver's word: whoever asks checks.
+    The solver's result is not verified here: the caller must check it.
     """
     nx = A.shape[-1]
     moved = prepared(Differences.free(A.mean(axis=0)), rate)
@@ -205,7 +207,7 @@ def common_norm(A: Float[Array, "S nx nx"], rate: float) -> Float[Array, "nx nx"
 
 
 def certificate(system: Differences, rate: float) -> Certificate | None:
-    """P and T by which all differences shrink by the rate in every sample; None if not found."""
+    """P and T that prove that all differences shrink at the rate; None if none are found."""
     moved = prepared(system, rate)
     if moved is None:
         return None
@@ -218,7 +220,7 @@ def certificate(system: Differences, rate: float) -> Certificate | None:
 
 
 def gain(system: Differences) -> float | None:
-    """Smallest γ for which |Δy| <= γ |Δu| is proven, as root sums of squares over all time."""
+    """Smallest γ with a proof of |Δy| <= γ |Δu|, for root sums of squares over all time."""
     sizes = [np.abs(M).max(initial=0.0) for M in (system.Cy, system.Dy, system.Bu, system.D)]
     y, u = max(sizes[:2]) or 1.0, max(sizes[2:]) or 1.0
     unit = replace(
@@ -255,7 +257,7 @@ def inequality(
     rate: float = 1.0,
     gain: float | None = None,
 ) -> Array:
-    """The matrix that shall be negative definite: for x and p, or with a gain for x, p and u."""
+    """The matrix that must be negative definite, for x and p, or with a gain for x, p and u."""
     return sum(S.T @ Q @ S for S, Q in _terms(system, P, T, rate, gain))  # pyright: ignore[reportReturnType]
 
 
@@ -279,9 +281,9 @@ def _terms(
 
 
 def prepared(system: Differences, rate: float) -> tuple[Differences, Array, Array] | None:
-    """The system for L x and s v, in which A nearly shrinks x, L and s; None if A is not stable."""
+    """The system for L x and s v, where A alone shrinks x, and L and s; None if A is unstable."""
     A = system.A / rate
-    finite = np.isfinite(A).all()  # the weights may be, and not their products
+    finite = np.isfinite(A).all()  # products of finite weights may be infinite
     if not finite or np.abs(np.linalg.eigvals(A)).max() >= 1.0 - ROUNDING:
         return None
     P, power = np.eye(len(A)), A
@@ -298,18 +300,18 @@ def prepared(system: Differences, rate: float) -> tuple[Differences, Array, Arra
 
 
 def returned(P: Array, T: Array, L: Array, s: Array) -> Certificate:
-    """P and T of a system from those for L x and s v."""
+    """P and T of a system, from the P and T of the system for L x and s v."""
     P = L.T @ P @ L
     return Certificate((P + P.T) / 2, T * s**2)
 
 
 def _unpacked(found: Array, nx: int, q: int) -> tuple[Array, Array]:
-    """P and T among the solver's unknowns."""
+    """P and T from the solver's unknowns."""
     return np.einsum("k,kij->ij", found[: -q - 1], _symmetric(nx)), found[-q - 1 : -1]
 
 
 def holds(system: Differences, found: Certificate, rate: float, gain: float | None = None) -> bool:
-    """Tell if P and T satisfy the inequality beyond rounding errors."""
+    """Tell if P and T satisfy the inequality by more than rounding errors."""
     P, T = found
     if P.shape != system.A.shape or len(T) != len(system.C) or not (T >= 0).all():
         return False
@@ -317,7 +319,7 @@ def holds(system: Differences, found: Certificate, rate: float, gain: float | No
 
 
 def _is_negative(terms: Sequence[tuple[Array, Array]]) -> bool:
-    """Tell if Σ Sᵀ Q S is negative definite beyond rounding errors."""
+    """Tell if Σ Sᵀ Q S is negative definite by more than rounding errors."""
     M = sum(S.T @ Q @ S for S, Q in terms)
     size = sum(np.abs(S).T @ np.abs(Q) @ np.abs(S) for S, Q in terms)
     assert isinstance(M, np.ndarray)
@@ -345,10 +347,13 @@ def _solved(
     weight: float,
     trace: Array | None = None,  # trace · ξ = 1
 ) -> tuple[Array, Array] | None:
-    """ξ of min weight ξ_objective with all constant + Σ ξ_k F_k <= 0, and the last's multiplier."""
+    """ξ that minimises weight ξ_objective, and the multiplier of the last inequality.
+
+    The inequalities are constant + Σ ξ_k F_k <= 0, one for each item of ``F`` and ``constants``.
+    """
     clarabel: Any = imported("clarabel", "certificate")
     n, count = F[0].shape[-1], len(F[0])
-    j, i = np.tril_indices(n)  # the upper triangle, column by column
+    j, i = np.tril_indices(n)  # gives the upper triangle column by column
     weights = np.where(i == j, 1.0, np.sqrt(2.0))
     rows = np.vstack([(each[:, i, j] * weights).T for each in F])
     right = np.concatenate([-constant[i, j] * weights for constant in constants])

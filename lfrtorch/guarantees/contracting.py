@@ -1,9 +1,10 @@
-"""A fit that keeps the certificate: every model on its way is proven to contract, for all inputs.
+"""A fit that keeps a certificate: every iterate is proven to contract, for all inputs.
 
-The inequality of ``certificate`` holds by a margin t, the largest that some P and T give. Its
-multiplier says how t changes with θ, to first order. A step that would leave none is replaced by
-the best one under a bound on that change, which is tightened until t is positive where the step
-ends. If there is no certificate still, the last point on the way there that has one is taken.
+The inequality of ``certificate`` holds by a margin t, the largest over all P and T. The multiplier
+of the inequality gives the derivative of t by θ. If a step would lead to a point with t <= 0, the
+best step under a linear bound on the decrease of t replaces it. This bound is tightened until t is
+positive at the end of the step. If the end still has no certificate, bisection finds the last point
+on the way there that has one.
 """
 
 from __future__ import annotations
@@ -36,22 +37,22 @@ from lfrtorch.least_squares.linear_systems import System
 from lfrtorch.maps.enclosure import Enclosure, everywhere
 
 HALVINGS = 6
-"""Halvings of the way to a step's end without a certificate."""
+"""Number of bisections of a step whose end has no certificate."""
 
 KEPT = 0.1
-"""Part of t that a step should leave for the next one."""
+"""Part of t that a step should keep, for the next step."""
 
 
 class Contracting:
-    """A guarantee: every model has a certificate of a rate, by default one below 1."""
+    """The guarantee that every model has a certificate of contraction at a rate below 1."""
 
     def __init__(self, cell: LFRCell, rate: float = SLOWEST) -> None:
         self._rate = rate
         self._cell = deepcopy(cell).to(device="cpu", dtype=torch.float64)
         if self._slopes is None:
             raise InputError(
-                "guarantee=contracting needs a network as the static map, whose slopes are "
-                f"bounded, not a {self._cell.map.title}."
+                "guarantee=contracting needs a static map with bounded slopes, which a network "
+                f"has, and not a {self._cell.map.title}."
             )
         self._free = [p for p in self._cell.parameters() if p.requires_grad]
         self._size = sum(p.numel() for p in self._free)
@@ -68,22 +69,22 @@ class Contracting:
         return self._cell.map.enclosure(everywhere(self._cell.nz))
 
     def _systems(self, theta: Float[Tensor, " P"]) -> list[Differences]:
-        """The inequality's matrices at θ."""
+        """The systems of differences at θ, whose matrices the inequality contains."""
         parts = theta[: self._size].detach().cpu().double().split([p.numel() for p in self._free])
         for p, part in zip(self._free, parts, strict=True):
             p.data = part.view_as(p)
         slopes = self._slopes
         assert slopes is not None
         systems = Differences.of(self._cell, slopes)
-        if not slopes.J.radius.all() and len(systems) > 1:  # at a start without output
+        if not slopes.J.radius.all() and len(systems) > 1:  # the map's output is zero at the start
             systems = [system for system in systems if system.neurons]
         return systems
 
-    @np.errstate(over="ignore", invalid="ignore")  # of a step that goes far too far
+    @np.errstate(over="ignore", invalid="ignore")  # a step may be far too long
     def _certified(
         self, theta: Float[Tensor, " P"], known: tuple[Differences, Certificate] | None
     ) -> tuple[Differences, Certificate] | None:
-        """The system at θ with a certificate: one that is known, if it holds, or a new one."""
+        """The system at θ with a certificate: the known one, if it holds at θ, or a new one."""
         systems = self._systems(theta)
         if known is not None:
             for system in systems:
@@ -96,7 +97,7 @@ class Contracting:
         return None
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
-        """θ if it has a certificate, or the last point on the way there that has."""
+        """θ if it has a certificate, or the last point on the way to θ that has one."""
         if not torch.isfinite(theta).all() or self._certified(theta, self._found) is not None:
             return theta
         last = theta.clone()
@@ -111,10 +112,10 @@ class Contracting:
         return last + low * (theta - last)
 
     def bounded(self, theta: Float[Tensor, " P"], system: System) -> System:
-        """The system of steps from θ, which has a certificate, that keep it."""
+        """The system whose steps from θ keep a certificate; θ has one."""
         self._last = theta.detach().cpu().double()
         found = self._certified(self._last, None) or self._certified(self._last, self._found)
-        if found is None:  # rounding of θ to single precision
+        if found is None:  # θ was rounded to single precision
             return system
         self._found = found
         own = found[0]
@@ -160,7 +161,7 @@ class Contracting:
             J = left * torch.as_tensor(s.middle) @ right
             right = torch.as_tensor(s.radius).unsqueeze(1) * right
         else:
-            # Each entry's extremes are at certain z, which stay the extremes to first order.
+            # Each entry of J is extreme at certain z; to first order it stays extreme there.
             centres = torch.as_tensor(slopes.centres)
             phi = static.flat_weights()
             with torch.no_grad():
@@ -177,7 +178,7 @@ class Contracting:
 
 
 class MarginBound:
-    """The bound of a step that leaves a number t(δ) positive."""
+    """The bound of a step δ that keeps the margin t(δ) positive."""
 
     trusted, corrections = False, 4
 
@@ -190,10 +191,11 @@ class MarginBound:
     def tightened(
         self, step: Float[Tensor, " P"], room: Float[Tensor, " 1"]
     ) -> Float[Tensor, " 1"] | None:
-        """The room to try next if t is not positive after a step; else None."""
+        """The room to try next if t is not positive after a step; otherwise None."""
         left = self.after(step)
         if left > 0.0:
             return None
         used = self.slopes.to(step) @ step[: self.slopes.shape[1]]
-        # t is left less than the bound says; half of it is tried to be kept.
+        # t has fallen by more than to first order. The excess shrinks the room, so that the part
+        # KEPT of t may be kept at the next try.
         return torch.minimum(room, used) - (KEPT * self.t - left)

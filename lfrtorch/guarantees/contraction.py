@@ -36,35 +36,36 @@ from lfrtorch.model.data_reach import Cloud, DataReach
 from lfrtorch.model.model import Model
 
 _FARTHEST = 2.0**20
-"""Factor of the data's rms to within which the largest amplitude is looked for."""
+"""The largest amplitude is searched between 1/_FARTHEST and _FARTHEST times the data's rms."""
 
-_HALVINGS, _MORE_CELLS = 6, 20  # of the rate in the region of the data; a solver's call each
+# Solver calls for the rate in the region of the data: bisections, and additions of cells.
+_HALVINGS, _MORE_CELLS = 6, 20
 
-_FIRST_CELLS, _LAST_CELLS = 2**12, 2**16  # of that region: of the first grid, and of all
+_FIRST_CELLS, _LAST_CELLS = 2**12, 2**16  # cells of that region in the first grid, and in all
 
 _SLACK = 0.02
-"""Part of 1 - ρ that a proof there may lose by the size of its cells."""
+"""Part of 1 - ρ that a proof in that region may lose by the size of its cells."""
 
 _LEAST = 1e-3
-"""The rate is looked for between this part of the best possible 1 - ρ and all of it."""
+"""1 - ρ is searched between this part of the largest possible 1 - ρ and all of it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Contraction:
-    """Result of a proof; ``print(contraction)`` says it in words.
+    """Result of the search for a proof; ``print(contraction)`` shows it in words.
 
     Args:
-        amplitude: that of the inputs about their offsets, (nu,), physical units, for the proof:
-            infinite if for all; 0 if nothing was found.
-        rate: ρ, the norm of the difference shrinks to ρ times its size or less in every sample; NaN
-            if nothing was found.
-        gain: γ, the largest root sum of squares of the outputs' difference over that of the
-            inputs', of all channels together, in physical units; NaN if none was found.
+        amplitude: largest |u - offset| of the inputs that the proof holds for, (nu,), physical
+            units: infinite if it holds for all inputs; 0 if no proof was found.
+        rate: ρ. The norm of the difference shrinks to at most ρ times its size in every sample;
+            NaN if no proof was found.
+        gain: γ, the largest ratio of the outputs' difference to the inputs' difference, as root
+            sums of squares of all channels together, in physical units; NaN if none was found.
         P: matrix of the norm √(ΔxᵀPΔx), (nx, nx), in the model's coordinates; ``None`` if none was
             found.
-        data_rate: ρ as long as z stays in the region of the data, in a norm of its own; NaN if it
-            was not looked for or not found.
-        reason: why nothing was found, or where a smaller rate may be.
+        data_rate: ρ as long as z stays in the region of the data, in another norm; NaN if it was
+            not searched or not found.
+        reason: why no proof was found, or how a smaller rate may be found.
         inputs, outputs: channel names and units.
 
     Example:
@@ -107,13 +108,13 @@ class Contraction:
         return "\n".join([*lines, *filter(None, [self.reason]), *self._near_data()])
 
     def _near_data(self) -> list[str]:
-        """A line on the rate in the region of the data, if it is another one."""
+        """A line on the rate in the region of the data, if it differs from ``rate``."""
         if math.isnan(self.data_rate) or self.data_rate == self.rate:
             return []
         return [f"As long as z is in the region of the data, they shrink to {self.data_rate:.6g}."]
 
     def _gain_unit(self) -> str:
-        """The unit of the gain, with the channels whose root sums of squares it compares."""
+        """The unit of the gain, and the channels whose root sums of squares it compares."""
         y, u = (
             list(dict.fromkeys(channel.unit for channel in channels))
             for channels in (self.outputs, self.inputs)
@@ -133,35 +134,36 @@ def contraction(
     *,
     amplitude: ArrayLike | None = None,
 ) -> Contraction:
-    """A proof that a model contracts, with its rate and gain, or why there is none.
+    """Search for a proof that a model contracts, with its rate and gain.
 
-    Under the same input, the difference of any two states shrinks to ``rate`` times its size or
-    less in each sample, in a norm that is the same everywhere. So the model forgets its start,
-    answers a periodic input with that period, and a change of the input changes the output by
-    ``gain`` times as much at most.
+    Under the same input, the difference of any two states shrinks to at most ``rate`` times its
+    size in each sample, in a norm that is the same everywhere. So the model forgets its start, and
+    responds to a periodic input with the same period. A change of the input changes the output by
+    at most ``gain`` times as much.
 
-    For inputs of an amplitude the slopes of the static map are those between the bounds of z that
-    ``bound`` proves, and the states those that such inputs reach from x = 0. Rate and gain may be
-    far smaller then than for all inputs, however loud.
+    For inputs up to an amplitude, only slopes of the static map within the bounds of z that
+    ``bound`` proves are considered, and only states that such inputs reach from x = 0. Rate and
+    gain may then be far smaller than for all inputs.
 
-    For the data of records the slopes are those in the smallest box, along the axes of its cloud,
-    that holds z of the simulations; then the proof is for trajectories whose z stay there. A model
-    that knows its data (``model.reach``) is told this rate, ``data_rate``, in any case.
+    For records, the slopes are those in the smallest box that contains z of their simulations; its
+    sides are along the principal axes of z. The proof then holds for trajectories whose z stays in
+    the box. This rate, ``data_rate``, is also searched without records if the model knows the range
+    of its data (``model.reach``).
 
     Args:
-        model: a linear model, or one with any network. For an amplitude, A must be stable, and
-            the network of tanh, sigmoid or rbf.
-        records: whose region is asked for. Default: none.
-        amplitude: largest |u - offset| of the inputs, physical units. Default: all inputs, or, if
-            nothing is found for them, the largest amplitude for which something is.
+        model: a linear model, or a model with any network. With an amplitude, A must be stable,
+            and the network must have tanh, sigmoid or rbf neurons.
+        records: records whose region of z the proof shall hold for. Default: none.
+        amplitude: largest |u - offset| of the inputs, physical units. Default: all inputs, or the
+            largest amplitude with a proof if there is none for all inputs.
 
     Shape:
         amplitude: (nu,) or a number for all inputs.
 
     Raises:
-        ValueError: a map whose slopes are not known to be bounded, an amplitude for a model that
-            ``bound`` refuses, records and an amplitude, or the package clarabel is missing:
-            ``lfrtorch[certificate]``.
+        ValueError: a map whose slopes are not known to be bounded; an amplitude, for a model that
+            ``bound`` refuses; both records and an amplitude; or the package clarabel is missing
+            (``lfrtorch[certificate]``).
 
     Example:
         >>> contraction = lfrtorch.analysis.contraction(model)
@@ -183,7 +185,7 @@ def contraction(
     scale, channels = model.scaler.u_scale, (model.inputs, model.outputs)
     if records is not None:
         if amplitude is not None:
-            raise InputError("records and amplitude are two regions; give one of them.")
+            raise InputError("records and amplitude are both given; give only one of them.")
         model = model.reaching(records)
     in_data = _in_data(cell, model.reach)
     if records is not None:
@@ -214,7 +216,7 @@ def contraction(
     )  # fmt: skip
     proven = gain(physical)
     proven = math.nan if proven is None else proven
-    # It takes more than twice as long to forget as the spectral radius allows.
+    # True if forgetting takes more than twice as long as the spectral radius allows.
     slow = np.isinf(size).all() and rate**2 > _radius(system)
     hint = ""
     if slow and cell.nw and math.isnan(data_rate):
@@ -226,16 +228,16 @@ def contraction(
 
 
 class _Norm(NamedTuple):
-    """A norm, and the rate to which it shrinks."""
+    """A norm, and the rate at which it shrinks."""
 
     P: Float[Array, "nx nx"]
     rate: float
 
 
 def _in_data(cell: LFRCell, reach: DataReach | None) -> _Norm | str:
-    """The best norm for z in the box of the data, or why there is none."""
-    # The mean slope between two z in the box is a mean of slopes in its cells, so that a norm which
-    # shrinks in all cells shrinks between the two.
+    """The best norm for z in the box of the data, or the reason why there is none."""
+    # The mean slope between two z in the box is a mean of slopes in its cells. So a norm that
+    # shrinks for the slopes of all cells shrinks the difference of any two trajectories.
     if not cell.nw:
         proof = _proof(cell, None)
         return proof if isinstance(proof, str) else _Norm(proof[1].P, _fastest(*proof)[0])
@@ -252,9 +254,9 @@ def _in_data(cell: LFRCell, reach: DataReach | None) -> _Norm | str:
     if steepest >= 1.0:
         return (
             f"linearised in the region of the data it has an eigenvalue of modulus {steepest:.4g}, "
-            "so that no norm shrinks there."
+            "so no norm shrinks there."
         )
-    # The solver sees a few cells, and then those that it was wrong about.
+    # The solver begins with a few cells. Then the cell that violates its result most is added.
     entries = J.reshape(len(A), -1)
     used = {int(radii.argmax()), *entries.argmin(axis=0), *entries.argmax(axis=0)}
     best: _Norm | None = None
@@ -277,14 +279,14 @@ def _in_data(cell: LFRCell, reach: DataReach | None) -> _Norm | str:
 
 
 def _norms(P: Float[Array, "nx nx"], A: Float[Array, "C nx nx"]) -> Float[Array, " C"]:
-    """|A| in the norm of P."""
+    """The norm of each A that the norm of P induces."""
     L = np.linalg.cholesky(P).T
     return np.linalg.norm(L @ A @ np.linalg.inv(L), 2, axis=(1, 2))
 
 
 @dataclass(frozen=True, eq=False)
 class _Box:
-    """The box of v = T (z - middle), T the axes of a cloud."""
+    """The box of v = T (z - middle), where T has the axes of a cloud."""
 
     cell: LFRCell
     z: Cloud
@@ -295,7 +297,7 @@ class _Box:
         return self.cell.map.slopes_in(cells, into, self.z.middle)
 
     def grid(self) -> Interval:
-        """Some cells of the box."""
+        """A first grid of cells of the box."""
         cells = Interval(*self.z.ends.T[:, None])
         while 2 ** cells.low.shape[1] * len(cells.low) <= _FIRST_CELLS:
             cells = cells.parts()
@@ -318,7 +320,7 @@ class _Box:
             norms = _norms(P, self.A(J.middle))
             rates = norms + np.linalg.norm(left @ J.radius @ right, 2, axis=(1, 2)) + ROUNDING
             count += len(rates)
-            # Where the cells' middles show that no better rate is true, none is looked for.
+            # The middles of the cells bound the true rate from below: no better rate is searched.
             goal = max(proven, float(norms.max()) + _SLACK * (1.0 - float(norms.max())))
             open_ = rates > goal
             if count > _LAST_CELLS:
@@ -337,25 +339,25 @@ def _slopes_within(cell: LFRCell, amplitude: Array) -> Enclosure | None:
 
 
 def _proof(cell: LFRCell, slopes: Enclosure | None) -> _Proof | str:
-    """A system with its certificate, or why there is none."""
+    """A system with its certificate, or the reason why there is none."""
     if slopes is not None:
         radius, place = _steepest(cell, slopes)
         if radius >= 1.0:
             return (
-                f"linearised {place} it has an eigenvalue of modulus {radius:.4g}, so that no norm "
+                f"linearised {place} it has an eigenvalue of modulus {radius:.4g}, so no norm "
                 "shrinks there."
             )
     for system in Differences.of(cell, slopes):
         found = certificate(system, _slow(system))
         if found is not None:
             return system, found
-    return "no norm was found that shrinks for all slopes within the bounds of the static map's."
+    return "no norm was found that shrinks for all slopes that the static map may have."
 
 
 def _steepest(cell: LFRCell, slopes: Enclosure) -> tuple[float, str]:
-    """Largest spectral radius among linearisations within the box, and where that is.
+    """Largest spectral radius among linearisations within the box, and its place in words.
 
-    Only z that some state and input bring about are tried.
+    Only z that some state and input can reach are tried.
     """
     every = max(1, len(slopes.centres) // 500)
     z = torch.as_tensor(slopes.centres[::every])
@@ -369,7 +371,7 @@ def _steepest(cell: LFRCell, slopes: Enclosure) -> tuple[float, str]:
 
 
 def _largest(cell: LFRCell, reason: str) -> tuple[Array, _Proof | str]:
-    """The largest amplitude, relative to the data's rms, with a proof; or none, and why."""
+    """The largest amplitude with a proof, relative to the data's rms; or 0 and the reason."""
     nothing = np.zeros(cell.nu)
 
     def attempt(factor: float) -> _Proof | str:
@@ -383,7 +385,7 @@ def _largest(cell: LFRCell, reason: str) -> tuple[Array, _Proof | str]:
     if isinstance(at_rest, str):
         return (
             nothing,
-            f"{at_rest}\nSo it is within the bounds that are proven for the smallest inputs.",
+            f"{at_rest}\nThis holds even within the bounds proven for the smallest inputs.",
         )
     low, high, best = 1.0 / _FARTHEST, _FARTHEST, at_rest
     while high > 1.02 * low:
@@ -402,7 +404,7 @@ def _slow(system: Differences) -> float:
 
 
 def _radius(system: Differences) -> float:
-    """The spectral radius with the slopes in the middle of their bounds: no rate is below it."""
+    """The spectral radius for slopes in the middle of their bounds; no rate is below it."""
     return float(np.abs(np.linalg.eigvals(system.A)).max())
 
 
@@ -410,7 +412,7 @@ def _fastest(system: Differences, slow: Certificate) -> tuple[float, Certificate
     """The smallest rate that is proven, with its certificate."""
     rate, found, best = _slow(system), slow, _radius(system)
     low, high = _LEAST, 1.0
-    for _ in range(9):  # halvings of the logarithm
+    for _ in range(9):  # bisections of the logarithm
         part = math.sqrt(low * high)
         tried = 1.0 - part * (1.0 - best)
         closer = certificate(system, tried)

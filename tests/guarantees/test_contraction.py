@@ -136,7 +136,7 @@ def test_the_region_of_the_data_has_a_proof_of_its_own():
     assert not known.found
     assert known.data_rate == pytest.approx(contraction.rate)
     assert "As long as z is in the region of the data" in str(known)
-    with pytest.raises(ValueError, match="records and amplitude are two regions"):
+    with pytest.raises(ValueError, match="records and amplitude are both given"):
         analysis.contraction(model, away, amplitude=0.1)
 
 
@@ -172,7 +172,7 @@ def test_two_rests_have_no_certificate():
     assert not contraction.found
     assert contraction.amplitude == 0.0
     assert "linearised at z = (" in contraction.reason
-    assert "eigenvalue of modulus 1.3, so that no norm shrinks there" in contraction.reason
+    assert "eigenvalue of modulus 1.3, so no norm shrinks there" in contraction.reason
     assert "no proof that the model contracts was found" in str(contraction)
 
 
@@ -198,7 +198,7 @@ def test_the_largest_amplitude_is_found_where_there_is_one():
 
 def test_without_a_bound_of_z_there_is_none_for_an_amplitude():
     contraction = analysis.contraction(scalar(1.1, Ww=-0.5))
-    assert "eigenvalue of modulus 1.1, so that no norm shrinks there" in contraction.reason
+    assert "eigenvalue of modulus 1.1, so no norm shrinks there" in contraction.reason
     assert "Nor is there one for an amplitude: A is not stable" in contraction.reason
     with pytest.raises(ValueError, match="A is not stable"):
         analysis.contraction(scalar(1.1, Ww=-0.5), amplitude=0.1)
