@@ -1,16 +1,18 @@
 """Rows of the Jacobian in machine code, for models with many states: blocks of samples.
 
-``jacobian_kernel`` takes every column through every sample, nx² products each. Here a few samples
-make a block, and what goes on inside it is found once for all columns: how the state after it and
-its outputs respond to the state before it, Q, to a change of the state after sample b, P(b), and to
-one of w at sample b, W(b). The rows then are products of large matrices::
+``jacobian_kernel`` propagates every column through every sample, with nx² products each. Here a few
+samples form a block, and the responses within a block are computed once for all columns. They are
+the responses of the state after the block, and of the outputs in it, to three causes: the state
+before the block, Q; a change of the state after sample b, P(b); and a change of w at sample b,
+W(b). The rows are then products of large matrices::
 
     [S_after; dy] = Q S_before + Σ_b P(b) G(b) + W(b) dw(b)
 
 with the direct terms G(b) of the state equation and dw(b) of w, see ``sensitivity``. The responses
-are found backwards: P(b-1) = P(b) F(b), with H(b) below it for the output at b, ends in Q = P(-1),
-and W(b) = P(b) Bw, with Dyw below it. A column of G(b) has one entry, so that it takes one column
-of P(b). A sample takes about nx ny + nx²/B products a column, for a block of B samples.
+are computed backwards: P(b-1) = P(b) F(b), with H(b) below it for the output at b, down to
+Q = P(-1); and W(b) = P(b) Bw, with Dyw below it. A column of G(b) has one nonzero entry, so it
+needs one column of P(b). For blocks of B samples, each sample takes about nx ny + nx²/B products a
+column.
 """
 
 from __future__ import annotations
@@ -24,13 +26,14 @@ from lfrtorch.engine.simulation_kernel import matrices
 from lfrtorch.maps.machine_code import call_slope, prepared
 
 SAMPLES = 12
-"""Samples in a block: 8 to 16 are as fast for 12 to 28 states; the responses then fit in cache."""
+"""Number of samples in a block. For 12 to 28 states, 8 to 16 samples are equally fast; the
+responses then fit in cache."""
 
 _WIDER = 2
-"""Samples after which the growing responses are copied to a wider array."""
+"""Number of samples after which the growing responses are copied to a wider array."""
 
 _TOGETHER = 32
-"""Least columns of a product, but for the last one."""
+"""Smallest number of columns of a product, except for the last product."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -53,7 +56,8 @@ def _rows(
 ):  # fmt: skip
     """Write the rows that ``jacobian_rows`` writes, from the same arguments.
 
-    BLAS rounds by the sizes of a product, so these are the same for any number of jobs.
+    Rounding in BLAS depends on the sizes of a product, so these sizes are the same for any number
+    of jobs.
     """
     A, _, Bw, Cz, _, Cy, _, Dyw, phi = matrices(sizes, weights)
     r, chunk = job // chunks, job % chunks
@@ -66,11 +70,11 @@ def _rows(
     k0 = np.searchsorted(edges[1:] * chunks, chunk * len(column), "right")
     k1 = np.searchsorted(edges[1:] * chunks, (chunk + 1) * len(column), "right")
     c0, c1 = edges[k0], edges[k1]
-    # Its own columns, how many of them are of x, and which is the first of the others.
+    # The columns of this job, the number of columns of x among them, and the first other column.
     own, n_own, w0 = column[c0:c1], max(0, min(c1, n_x) - c0), max(0, c0 - n_x)
 
-    # The first rows of a response are those of the state after the block; the outputs follow, the
-    # last one first, so that each step backwards adds rows at the end. All are transposed.
+    # A response begins with the rows of the state after the block. The outputs follow, the last
+    # output first, so that each step backwards adds rows at the end. All arrays are transposed.
     wide = nx + SAMPLES * ny
     P = np.zeros((nx, SAMPLES, wide), rows.dtype)
     QW = np.zeros((nx + nw * SAMPLES, wide), rows.dtype)
@@ -78,7 +82,7 @@ def _rows(
     M = np.zeros((nx + nw, nx), rows.dtype)
     copy_to(Bw.T, M[nx:], 0)
     AT, CyT, DywT = A.T.copy(), Cy.T.copy(), Dyw.T.copy()
-    # Transposed as well: columns of x have S and direct terms, the others S with d_w beside it.
+    # Also transposed: columns of x have S and direct terms; other columns have S, with d_w beside.
     Sx, direct = np.zeros((n_own, nx), rows.dtype), np.zeros((n_own, SAMPLES), rows.dtype)
     Sw = np.zeros((len(own) - n_own, len(QW)), rows.dtype)
     by, of_direct = np.empty((len(own), wide), rows.dtype), np.empty((n_own, wide), rows.dtype)
@@ -198,10 +202,10 @@ def add_feedback(driveT, J, Cz, out):
 
 @njit(nogil=True)
 def _sorted(x_entries, n_z, n_y, C, nx):
-    """Columns but those of y, which leave S unchanged, and the beginnings of their products.
+    """All columns except those of y, which do not change S, and the beginnings of their products.
 
-    Columns of x come first, by the state that they drive; also returned: each state's first one.
-    Their products hold all columns of a state, as these share its P.
+    Columns of x come first, sorted by the state that they drive; the first column of each state is
+    also returned. A product has all columns of a state, as these share its P.
     """
     n_x, start = len(x_entries), np.zeros(nx + 1, np.int64)
     for n in range(n_x):
@@ -223,7 +227,7 @@ def _sorted(x_entries, n_z, n_y, C, nx):
 
 @njit(nogil=True)
 def _without_dust(source, target, n):
-    """The first n columns; entries that fade to denormal numbers, which are slow, become 0."""
+    """Copy the first n columns; entries near denormal numbers, which are slow, become 0."""
     for c in range(len(source)):
         for i in range(n):
             a = source[c, i]

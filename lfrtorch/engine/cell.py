@@ -109,14 +109,14 @@ class LFRCell(nn.Module):
         self.Cy, self.Dyu, self.Dyw = matrix(ny, nx), matrix(ny, nu), matrix(ny, nw)
         self.static = static
         self.state_covariance: Tensor
-        """E x xᵀ (nx, nx) over the training data, about 0; before a fit 1."""
-        # Not torch.eye: on the device "meta" it imports torch's compiler, which takes a second.
+        """E x xᵀ (nx, nx) over the training data, about 0; the identity before a fit."""
+        # On the device "meta" torch.eye would import torch's compiler, which takes a second.
         identity = torch.zeros(nx, nx, device=device, dtype=dtype).fill_diagonal_(1.0)
         self.register_buffer("state_covariance", identity)
         self.held: dict[str, Tensor] = {}
         """Masks of the entries that a fit holds, by the names of the parameters; see ``hold``."""
         self.of_system: Held | None = None
-        """Entries of A, Bu and Bw that the system of a predictor holds; None of any other model."""
+        """For a predictor, held entries of A, Bu and Bw of its system; otherwise None."""
         self._check_shapes()
         if not isinstance(random, bool):
             raise InputError(f"random is {random!r}; give True or False.")
@@ -125,11 +125,11 @@ class LFRCell(nn.Module):
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
-        """A random stable start by torch's generator; the static map keeps its own.
+        """Draw random matrices of a stable model by torch's generator; the map does not change.
 
-        A turns the states and shrinks them by 0.9 a sample, as ``torch.nn.init.orthogonal_`` finds
-        it; white inputs of unit variance give states, z and outputs of about that. Bw is 0, so that
-        the model is stable whatever the map is; Dyw is not, so all weights have a gradient at once.
+        A is 0.9 times a random orthogonal matrix. White inputs of unit variance give states, z and
+        outputs of about unit variance. Bw is 0, so the model is stable whatever the map is. Dyw is
+        not 0, so the weights of the map have a gradient from the beginning.
         """
         for p in self.parameters(recurse=False):
             p.zero_()
@@ -150,7 +150,7 @@ class LFRCell(nn.Module):
             given: masks and values by the names of the parameters, as ``engine.held`` makes them.
 
         Raises:
-            ValueError: another value of an entry that is held already.
+            ValueError: an entry is already held at another value.
         """
         for name, (entries, values) in given.items():
             p = self.get_parameter(name)
@@ -161,8 +161,8 @@ class LFRCell(nn.Module):
             if apart.any():
                 at = tuple(apart.nonzero()[0].tolist())
                 raise InputError(
-                    f"{name}{list(at)} is held at {float(own[at]):.6g}, and something else of what "
-                    f"is given holds it at {float(wanted[at]):.6g} (normalised): leave out one."
+                    f"{name}{list(at)} is held at {float(own[at]):.6g} by one setting and at "
+                    f"{float(wanted[at]):.6g} by another (normalised); leave out one of them."
                 )
             p[mask] = wanted[mask]
             if mask.any():
@@ -188,12 +188,12 @@ class LFRCell(nn.Module):
 
     @property
     def autocast(self) -> bool:
-        """Tell whether ``torch.autocast`` is on; the layer keeps to its weights' dtype."""
+        """Tell whether ``torch.autocast`` is on; the layer computes in its weights' dtype."""
         device = self.A.device.type
         return device != "meta" and torch.is_autocast_enabled(device)
 
     def uncast(self, *signals: Any) -> list[Any]:
-        """Signals in the dtype of the weights, if they are in that of ``torch.autocast``."""
+        """Signals, cast to the dtype of the weights if they have that of ``torch.autocast``."""
         chosen = torch.get_autocast_dtype(self.A.device.type)
         own = [isinstance(each, Tensor) and each.dtype == chosen for each in signals]
         pairs = zip(signals, own, strict=True)
@@ -212,7 +212,7 @@ class LFRCell(nn.Module):
         return as_map(self.static, self.nz, self.nw)
 
     def weights(self, given: Sequence[Tensor] | None = None) -> Weights:
-        """Vector of all numbers of the cell: those it has now, or the parameters that are given."""
+        """Vector of all numbers of the cell: its present parameters, or the given ones."""
         named = list(self.named_parameters())
         parameters = [(name, p.numel(), p.requires_grad) for name, p in named]
         sizes = self.nx, self.nu, self.ny, self.nz, self.nw
@@ -248,15 +248,15 @@ class LFRCell(nn.Module):
         for name, shape in shapes.items():
             if name not in weights:
                 raise InputError(
-                    f"{name} is no parameter any more, as of a parametrisation or a pruning; the "
-                    "equations need it as it is.\nA static map of torch's own layers may have one: "
-                    "static=torch.nn.Sequential(...)."
+                    f"{name} is not a parameter any more, as after a parametrisation or a pruning; "
+                    "the equations need it.\nOnly the layers of a static map of torch's modules "
+                    "may be changed so: static=torch.nn.Sequential(...)."
                 )
             found = tuple(weights[name].shape)
             if found != shape:
                 raise InputError(
                     f"{name} has the shape {found}; with nu={nu}, ny={ny}, nx={nx}, nz={nz} and "
-                    f"nw={nw} it is {shape}: give a matrix or a static map of these sizes."
+                    f"nw={nw} it must be {shape}: give a matrix or a static map of these sizes."
                 )
         return {name: weights[name] for name in shapes}
 
@@ -296,8 +296,8 @@ class LFRCell(nn.Module):
         """Refuse a tensor of another dtype or device than A."""
         if tensor.dtype != self.A.dtype or tensor.device != self.A.device:
             raise InputError(
-                f"{name} is {tensor.dtype} on {tensor.device} and the model {self.A.dtype} on "
-                f"{self.A.device}; give {name}.to({self.A.dtype}), or move the model: both alike."
+                f"{name} is {tensor.dtype} on {tensor.device}, but the model is {self.A.dtype} on "
+                f"{self.A.device}; convert {name} or the model, so that both are alike."
             )
 
     def extra_repr(self) -> str:

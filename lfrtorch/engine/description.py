@@ -15,29 +15,29 @@ from lfrtorch.data.records import Channel
 from lfrtorch.engine.operating_point import StateSpace
 
 _MOST_POLES = 6
-"""Most rows of the table of poles; those of the largest radius are kept."""
+"""Largest number of rows in the table of poles; the poles of the largest radius are shown."""
 
 _MOST_GAINS = 4
-"""Most rows of the table of gains."""
+"""Largest number of rows in the table of gains."""
 
 _INTEGRATES = 1e-9
-"""Distance of a pole from 1 up to which it integrates: there is no static gain."""
+"""Distance from 1 up to which a pole counts as an integrator, without a static gain."""
 
 _ROUNDING = 1e-12
-"""An offset below this part of the rms about it is a rounding error."""
+"""An offset below this part of the rms about it counts as a rounding error."""
 
 _LISTED = 4
-"""Most channels of a side that a line names."""
+"""Largest number of inputs, or of outputs, that a line names."""
 
 
 def listed(channels: Sequence[Channel]) -> str:
-    """Names and units of the channels; of many, the first ones."""
+    """Names and units of the channels; only the first ones if there are many."""
     more = ["..."] * (len(channels) > _LISTED)
     return ", ".join([*map(str, channels[:_LISTED]), *more])
 
 
 def levels(channels: Sequence[Channel], offset: Array, scale: Array | None = None) -> str:
-    """Offset of each channel and rms about it; of many channels, the first ones."""
+    """Offset of each channel and rms about it; only the first channels if there are many."""
     said = []
     for i, channel in enumerate(channels[:_LISTED]):
         value = number(offset[i])
@@ -76,7 +76,7 @@ def system_lines(
     inputs: Sequence[Channel],
     outputs: Sequence[Channel],
 ) -> list[str]:
-    """Tables of poles and gains at rest of systems by name, physical units, next to each other."""
+    """Tables of poles and gains at rest, in physical units, of named systems side by side."""
     head, columns, count, fast = [], [], 0, False
     for name, system in systems.items():
         roots = frequency_and_damping(np.linalg.eigvals(system.A).astype(complex), fs)

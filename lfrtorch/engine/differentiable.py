@@ -1,8 +1,8 @@
 """The simulation as a function of torch: gradients, forward derivatives and batches of them.
 
-Each pass in machine code is a ``torch.autograd.Function`` of its own, with a rule for ``vmap``: the
-simulation, its adjoint (gradients: ``grad``, ``jacrev``, ``backward``) and its tangent (``jvp``,
-``jacfwd``). Neither derivative can be differentiated again.
+Each pass in machine code is a ``torch.autograd.Function`` with a rule for ``vmap``: the simulation,
+its adjoint (gradients: ``grad``, ``jacrev``, ``backward``) and its tangent (``jvp``, ``jacfwd``).
+Adjoint and tangent cannot be differentiated again.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ _TWICE = (
 
 
 Batch = tuple[tuple[Tensor, ...], tuple[int, ...]]
-"""Results of a rule for ``vmap``, and their axes of the batch."""
+"""Results of a rule for ``vmap``, and the batch axis of each result."""
 
 
 def _batched(
     function: type[Function], signals: int, info: Any, in_dims: Any, *inputs: Any
 ) -> Batch:
     """Apply a function of a cell, ``signals`` with an axis of records, and weights to a batch."""
-    # A batch of signals is more records of one simulation; each set of weights is a simulation.
+    # A batch of signals becomes further records of one simulation. A batch of weights needs one
+    # simulation for each set of weights.
     first, tensors, axes = inputs[:2], inputs[2:], in_dims[2:]
     if all(axis is None for axis in axes[signals:]):
         B = info.batch_size
@@ -58,7 +59,7 @@ class _Once(Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        """Keep nothing for a second derivative."""
+        """Save nothing, as there is no second derivative."""
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> NoReturn:
@@ -77,7 +78,7 @@ class _Adjoint(_Once):
         cell: LFRCell, periodic: bool, e: Tensor, end: Tensor, u: Tensor, x: Tensor, z: Tensor,
         w: Tensor, *weights: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-        signals = Trajectory(x, z, w, e)  # y does not matter
+        signals = Trajectory(x, z, w, e)  # e stands in for y, which is not used
         about = Linearisation(cell.weights(weights), u, signals, periodic=periodic, every=True)
         with torch.autocast(u.device.type, enabled=False):
             found = about.adjoint(e, end)
@@ -90,7 +91,7 @@ class _Adjoint(_Once):
 
 
 class _Tangent(_Once):
-    """Changes of y and x(T) with u, x0 and the weights."""
+    """Changes of y and x(T) by changes of u, x0 and the weights."""
 
     @staticmethod
     def forward(
@@ -98,7 +99,7 @@ class _Tangent(_Once):
         w: Tensor, *both: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         changes, weights = both[: len(both) // 2], both[len(both) // 2 :]
-        signals = Trajectory(x, z, w, u)  # y does not matter
+        signals = Trajectory(x, z, w, u)  # u stands in for y, which is not used
         about = Linearisation(cell.weights(weights), u, signals, periodic=periodic, every=True)
         d_theta = torch.cat([change.flatten() for change in changes])
         return about.tangent_with_end(d_theta, None if periodic else d_x0, d_u)
@@ -110,13 +111,13 @@ class _Tangent(_Once):
 
 
 class Simulation(Function):
-    """Simulation from a cell, u, x0 and weights: y, x(T) and, without gradients, x, z and w."""
+    """Simulation of a cell from u, x0 and weights: y and x(T), and x, z, w without gradients."""
 
     @staticmethod
     def forward(
         cell: LFRCell, periodic: bool, u: Tensor, x0: Tensor, *weights: Tensor
     ) -> tuple[Tensor, ...]:
-        """Simulate with the weights, whatever the cell holds."""
+        """Simulate with the given weights in place of the cell's own."""
         cell.check()
         W = cell.weights(weights)
         found = steady_state(W, u, x0) if periodic else simulate(W, u, x0)
@@ -128,7 +129,7 @@ class Simulation(Function):
         ctx.cell, ctx.periodic, u, _, *weights = inputs
         _, _, *signals = output
         ctx.mark_non_differentiable(*signals)
-        ctx.set_materialize_grads(False)  # signals without one are large
+        ctx.set_materialize_grads(False)  # zero gradients of x, z and w would take much memory
         ctx.save_for_backward(u, *signals, *weights)
         ctx.save_for_forward(u, *signals, *weights)
 

@@ -1,4 +1,4 @@
-"""An NL-LFR with constant disturbances of its inputs and outputs as further states.
+"""An NL-LFR whose additional states are constant disturbances of its inputs and outputs.
 
 An unmeasured constant disturbance d, such as a load or a leak, adds Eu d to the inputs and Ey d to
 the outputs. It is modelled as a constant state, so that an observer estimates it with x::
@@ -28,7 +28,7 @@ from lfrtorch.engine.operating_point import StateSpace
 _DRIFT = 0.1
 """Drift of a disturbance per slowest time constant, relative to its scale (rms)."""
 
-_FASTEST, _SLOWEST = 1.0, 1e4  # time constants, in samples; integrators have none
+_FASTEST, _SLOWEST = 1.0, 1e4  # limits of time constants in samples; integrators do not count
 
 
 def disturbed_cell(cell: LFRCell, E: Float[Array, "n nd"], scaler: Scaler) -> LFRCell:
@@ -57,7 +57,7 @@ def disturbed_cell(cell: LFRCell, E: Float[Array, "n nd"], scaler: Scaler) -> LF
 
 
 def disturbance_scale(E: Float[Array, "n nd"], scaler: Scaler) -> Float[Array, " nd"]:
-    """The size of each disturbance that moves one of its channels by the channel's scale."""
+    """The size of each disturbance that moves its most affected channel by the channel's scale."""
     each = np.abs(E) / np.concatenate([scaler.u_scale, scaler.y_scale])[:, None]
     return 1.0 / each.max(axis=0)
 
@@ -65,15 +65,15 @@ def disturbance_scale(E: Float[Array, "n nd"], scaler: Scaler) -> Float[Array, "
 def drift_variance(moduli: Array, scale: Float[Array, " nd"]) -> Float[Array, " nd"]:
     """Variance of the change of each disturbance in one sample.
 
-    The rms change over the slowest time constant, from the moduli of the poles without
-    integrators, is a tenth of the disturbance's scale."""
+    The rms change over the slowest time constant is a tenth of the disturbance's scale. ``moduli``
+    are those of the poles, without integrators."""
     stable = moduli[moduli < math.exp(-1.0 / _SLOWEST)]
     slowest = -1.0 / math.log(max(stable.max(initial=0.0), math.exp(-1.0 / _FASTEST)))
     return (_DRIFT * scale) ** 2 / slowest
 
 
 def tells_apart(system: StateSpace, states: int) -> bool:
-    """Tell if the disturbances, the last states, are detectable from the outputs at rest."""
+    """Tell if the outputs at rest determine the disturbances, which are the last states."""
     # Pannocchia and Rawlings: [A - 1, Bd; C, Cd] has full column rank.
     rows = np.vstack([system.A[:states] - np.eye(states, len(system.A)), system.C])
     values = np.linalg.svd(rows / np.maximum(np.abs(rows).max(axis=0), 1e-300), compute_uv=False)

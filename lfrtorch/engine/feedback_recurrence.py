@@ -1,7 +1,7 @@
 """Recurrences of the linearised model without forming F(k) = A + Bw J(k) Cz.
 
-J(k) has nw nz entries and F(k) has nx². A step of one column takes nx (nx + nz + nw) products.
-Compiled code serves the CPU; other devices form F and use ``scan``.
+J(k) has nw nz entries, and F(k) has nx². A step of one column takes nx (nx + nz + nw) products.
+On the CPU compiled code is used; other devices form F and use ``scan``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def states(
 ) -> Float[Tensor, "R T+1 nx"]:
     """States of s(k+1) = F(k) s(k) + g(k) from the known s(0).
 
-    Backwards: costates of s(k) = F(k)ᵀ s(k+1) + g(k) from the known s(T).
+    If ``backwards``: costates of s(k) = F(k)ᵀ s(k+1) + g(k) from the known s(T).
     """
     if has_kernels(J):
         s = g.new_empty(len(g), g.shape[1] + 1, g.shape[2])
@@ -80,7 +80,7 @@ def _forwards(first, jobs, step, A, Bw, Cz, J, g, s):
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"})
 def _forwards_of(r, A, Bw, Cz, J, g, s):
-    # Transposed, so that inner loops run over neighbours in memory: vector instructions.
+    # Transposed, so that inner loops run over contiguous memory and become vector instructions.
     AT, BwT, J, g, s = A.T.copy(), Bw.T.copy(), J[r], g[r], s[r]
     nw, nx = BwT.shape
     for k in range(len(g)):
@@ -139,10 +139,10 @@ def _transition(r, A, Bw, Cz, J, Phi):
     for k in range(len(J)):
         copy_to(A.T, F, 0)
         add_feedback(BwT, J[k], Cz, F)
-        np.dot(X, F, X_next)  # transposed, all of them
+        np.dot(X, F, X_next)  # all three are transposed
         X, X_next = X_next, X
         if k % 256 == 255:
             flush(X)
-            if not X.any():  # faded: it stays 0
+            if not X.any():  # the transition has decayed to 0
                 break
     copy_to(X.T, Phi, 0)

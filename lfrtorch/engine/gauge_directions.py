@@ -1,8 +1,8 @@
 """Gauge directions: changes of a model's numbers that leave its output unchanged.
 
 Many sets of matrices describe the same model. A change of coordinates x -> T x changes A, Bu, Bw,
-Cz and Cy, and no output. The same holds for z and w if the static map is a network, whose weights
-absorb the change. To first order these changes are directions, a column each.
+Cz and Cy, but no output. The same holds for z and w if the static map is a network, whose weights
+absorb the change. To first order each such change is a direction: a column of G.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from lfrtorch.engine.held import held_parameters
 from lfrtorch.engine.weights import Weights
 
 ROUNDING = 1e-10
-"""A pivot below this part of the largest, or of the norm of G, is a rounding error."""
+"""A pivot below this part of the largest pivot, or of the norm of G, counts as a rounding error."""
 
 
 def free_directions(cell: LFRCell) -> int:
-    """Number of gauge directions that move no entry that a fit holds.
+    """Number of gauge directions that change no held entry.
 
-    The count is the generic one, of random numbers in all entries that are not held. A start, whose
-    static map has no output, has more directions.
+    The count is made with random numbers in all free entries. A start, whose static map has no
+    output, has more directions.
     """
     count = cell.nx**2 + sum((s.place.stop - s.place.start) ** 2 for s in cell.map.symmetries)
     if not cell.held:
@@ -40,7 +40,7 @@ def free_directions(cell: LFRCell) -> int:
         np.random.default_rng(0).standard_normal(int((~held).sum()))
     )
     G = gauge_directions(numbers, numbers.flat.new_zeros(0, cell.nx))[held]
-    # A column of zeros is a direction that moves nothing: those of z and w, where x has zeros.
+    # Columns of zeros are left out: directions of z and w that change no held entry.
     G = G[:, G.any(axis=0)]
     diagonal = np.abs(np.diag(scipy.linalg.qr(G, mode="r", pivoting=True)[0]))
     return count - int((diagonal > ROUNDING * diagonal.max(initial=0.0)).sum())
@@ -50,8 +50,8 @@ def gauge_directions(
     W: Weights, initial_states: Float[Tensor, "S nx"]
 ) -> Float[Array, "numbers directions"]:
     """Gauge directions G of all numbers, then of the initial states."""
-    # T is every matrix with one entry 1, stacked: a direction for each. x -> (I + εT) x changes
-    # A to A + ε (TA - AT), and so on; z -> (I + εT) z and w -> (I + εT)⁻¹ w likewise.
+    # T stacks all matrices with a single entry 1, each of which gives a direction. x -> (I + εT) x
+    # changes A to A + ε (TA - AT), and so on; likewise z -> (I + εT) z and w -> (I + εT)⁻¹ w.
     T = _units(W.nx, W.flat)
     of_x = {"A": T @ W.A - W.A @ T, "Bu": T @ W.Bu, "Bw": T @ W.Bw, "Cz": -W.Cz @ T}
     groups = [_flat(W, of_x | {"Cy": -W.Cy @ T, "x0": initial_states @ T.mT}, initial_states)]

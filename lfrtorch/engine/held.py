@@ -29,12 +29,13 @@ def structure(cell: LFRCell, kind: str, *, before: int | None = None) -> Held:
 
     - ``"free"``: none;
     - ``"wiener"``: w acts on the output alone, Bw = 0;
-    - ``"hammerstein"``: z is of the inputs alone, Cz = 0;
-    - ``"wiener_hammerstein"``: the first states, which u drives, make z; the others, which w alone
-      drives, see nothing of them. So w never comes back to z;
-    - ``"parallel"``: the same with a function for each z, which makes the w of the same number:
-      branches that share their poles at most. A network is held so; of another map each branch has
-      its own (:class:`lfrtorch.maps.direct_sum.DirectSum`).
+    - ``"hammerstein"``: z depends on the inputs alone, Cz = 0;
+    - ``"wiener_hammerstein"``: u drives the first states, on which z depends; w alone drives the
+      other states. So w never acts on z;
+    - ``"parallel"``: as ``"wiener_hammerstein"``, where each w is a function of the z of the same
+      number, so that the branches share at most their poles. In a network weights between branches
+      are held at zero; other maps have a map for each branch
+      (:class:`lfrtorch.maps.direct_sum.DirectSum`).
 
     Args:
         cell: the model whose sizes are used.
@@ -42,7 +43,7 @@ def structure(cell: LFRCell, kind: str, *, before: int | None = None) -> Held:
         before: number of states that drive z. Default: half of them.
 
     Raises:
-        ValueError: a map that is no function for each z.
+        ValueError: ``"parallel"`` with a map that is not a function for each z.
     """
     every, zero = torch.tensor(True), torch.tensor(0.0)
     after = torch.arange(cell.nx) >= (cell.nx // 2 if before is None else before)
@@ -78,13 +79,13 @@ def no_feedthrough(cell: LFRCell, *, z: bool, y: bool) -> Held:
 
 
 def past_outputs(cell: LFRCell) -> Held:
-    """Zeros of a predictor without feedthrough from its last inputs, the measured outputs."""
+    """Zeros of a predictor: no feedthrough from its last inputs, which are measured outputs."""
     last = torch.arange(cell.nu) >= cell.nu - cell.ny
     return {name: (last, torch.tensor(0.0)) for name in ("Dzu", "Dyu")}
 
 
 def measured_states(cell: LFRCell) -> Held:
-    """The output's equation of a model whose states are its normalised outputs."""
+    """The output equation of a model whose states are its normalised outputs."""
     every, zero = torch.tensor(True), torch.tensor(0.0)
     return {"Cy": (every, torch.eye(cell.nx)), "Dyu": (every, zero), "Dyw": (every, zero)}
 
@@ -100,16 +101,16 @@ def integrators(cell: LFRCell) -> Held:
 def integrating_states(cell: LFRCell) -> Bool[Tensor, " nx"]:
     """States that are exact integrators.
 
-    Such a state's column of A is 0 but for a 1 on the diagonal and entries in rows of other
-    integrators, and its column of Cz is 0: nothing but integrators and the output sees it. Then
-    z = 1 is a pole of the model whatever its other parameters are, and a shift of that state shifts
-    the output for good. Two in a row are a double pole.
+    In such a state's column A is 0, but for a 1 on the diagonal and entries in rows of other
+    integrators; Cz is 0 there. So this state acts on other integrators and the output alone. Then
+    z = 1 is a pole of the model whatever its other parameters are, and a shift of the state shifts
+    the output for ever. Two integrators in series are a double pole.
     """
     A = cell.A.detach()
     acts = A - torch.diag(A.diagonal()) != 0
     candidates = (A.diagonal() == 1) & ~cell.Cz.detach().any(dim=0)
     found = torch.zeros_like(candidates)
-    for _ in range(cell.nx):  # the last of a chain comes first
+    for _ in range(cell.nx):  # the last integrator of a chain is found first
         found = candidates & ~acts[~found].any(dim=0)
     return found
 

@@ -1,9 +1,9 @@
 """The initial state of a record, estimated from its output.
 
-The output depends on the initial state until the transition Φ(k) = ∂x(k)/∂x(0) has faded, and
-counts until the last sample with a weight. Later samples cost nothing here but, before a fit, one
-simulation from rest. The search is in ``start_kernel``. A model whose map has no machine code takes
-the same steps in torch, for all records at once.
+The output depends on the initial state until the transition Φ(k) = ∂x(k)/∂x(0) has decayed, and it
+counts up to the last sample with a weight. Later samples are not simulated, except once from rest
+before a fit. The search is in ``start_kernel``. A model whose map has no machine code takes the
+same steps in torch, for all records at once.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from lfrtorch.engine.start_kernel import (
 from lfrtorch.engine.weights import Weights
 
 _FLAT = 1e-4
-"""Least variance of the prior relative to the largest."""
+"""Smallest variance of the prior relative to the largest."""
 
 _ODD = 1e-3
-"""Least part of the cost that the prior adds if it makes a difference."""
+"""The prior counts as making no difference if it adds less than this part of the cost."""
 
 _FAR = 0.1
 """Ratio of squared errors below which a state far from the training data is accepted. Over 50
-measured samples it is 0.2 or more where the state is wrong for the rest of the record."""
+measured samples the ratio is at least 0.2 if the state is wrong for the rest of the record."""
 
 _FAR_BETTER = 0.25
 """Ratio of squared errors below which the state from a record's beginning is refined."""
@@ -49,7 +49,7 @@ _AWAY = 100.0
 """Growth of xᵀ P⁻¹ x, after the samples that determine the state, that counts as divergence."""
 
 _BEGINNING = 8
-"""Least number of outputs in a beginning, for each state."""
+"""Smallest number of outputs in a beginning, for each state."""
 
 
 @torch.no_grad()
@@ -62,9 +62,9 @@ def start_from_beginning(
 ) -> Float[Tensor, "R nx"]:
     """Initial state by ``estimated_start``, or from the first half, quarter, ... of each record.
 
-    The error over a long oscillation has many minima, one for each phase; over its beginning it has
-    few. The state from a beginning is refined on the whole record, and kept if it makes the squared
-    error far smaller.
+    The error over a long oscillation has many minima, one for each phase; the error over its
+    beginning has few. The state from a beginning is refined on the whole record, and kept if it
+    makes the squared error far smaller.
     """
     W = model.weights()
     best, T = simulate(W, u, estimated_start(W, u, y, weight)), u.shape[1] // 2
@@ -83,7 +83,7 @@ def start_from_beginning(
 def measured_start(
     model: Numbers, u: Float[Tensor, "R nu"], y: Float[Tensor, "R ny"]
 ) -> Float[Tensor, "R nx"]:
-    """State nearest to rest whose output is the measured one, or is nearest to it."""
+    """State nearest to rest whose output equals, or is nearest to, the measured output."""
     W = model.weights()
     x = u.new_zeros(len(u), W.nx)
     for _ in range(ITERATIONS):
@@ -110,12 +110,12 @@ def estimated_start(
 ) -> Float[Tensor, "R nx"]:
     """The most probable initial state, given the output and the factors of its errors.
 
-    Least squares alone fits noise and slow model errors if samples are few and states many. So a
-    normal prior adds x0ᵀ P⁻¹ x0 to the squared errors divided by their variance
-    (``state_moments``); ``PASSES`` estimate that variance. The least squares state is kept in two
-    cases: if it is far better, as a system may begin far from the training data, or if the prior
-    makes no difference, as with far more samples than states. A state from which the model diverges
-    is replaced by rest, if the model does not diverge from rest. ``near`` is the initial state of a
+    Least squares alone fits noise and slow model errors if samples are few and states are many. So
+    a normal prior adds x0ᵀ P⁻¹ x0 (``state_moments``) to the squared errors over their variance,
+    which several passes estimate (``PASSES``). The least squares state is kept in two cases: if it
+    is far better, as a system may begin far from the training data; or if the prior makes no
+    difference, as with far more samples than states. A state from which the model diverges is
+    replaced by rest, if the model does not diverge from rest. ``near`` is the initial state of a
     similar model: the search begins there if its errors are smaller than those from rest.
     """
     W = model.weights()
@@ -127,7 +127,7 @@ def estimated_start(
     moments = np.where(known[:, None], np.maximum(moments, _FLAT * moments[:, -1:]), 1.0)
     deviations = np.sqrt(moments)[:, None]
     white = np.ascontiguousarray((axes / deviations).swapaxes(1, 2)) * known[:, None, None]
-    # Samples after the last one with a weight do not count.
+    # Samples after the last sample with a weight are left out.
     last = 1 + int(np.flatnonzero(factors.any(axis=(0, 2))).max(initial=0))
     whole, u, y, weight = u, u[:, :last].contiguous(), y[:, :last], weight[:, :last]
     rest = simulate(W, u, None)
@@ -140,7 +140,7 @@ def estimated_start(
         first = _chosen(closer, there, rest)
     free = _fitted_start(W, u, y, weight, first)
     x0 = to_float64(free.x[:, 0])
-    stayed = ~x0.any(axis=1)  # Gauss-Newton may fail on many states
+    stayed = ~x0.any(axis=1)  # Gauss-Newton may fail if there are many states
     odd = ((white @ x0[..., None]) ** 2).sum(axis=(1, 2)) > _ODD * counted
     found = free
     if (known & (stayed | odd)).any():
@@ -159,7 +159,7 @@ def _staying(
     x: Float[Tensor, "R S nx"],
     white: Float[Array, "R nx nx"],
 ) -> Float[Tensor, "R nx"]:
-    """First of the states x, or 0 if the model diverges after them but not from 0."""
+    """First of the states x; 0 if the model diverges after these states, but not from 0."""
 
     def farthest(states: Tensor) -> Array:
         sizes = ((to_float64(states) @ white.swapaxes(1, 2)) ** 2).sum(axis=2).max(axis=1)
@@ -175,9 +175,9 @@ def _staying(
 def state_moments(model: Numbers, u: Float[Tensor, "R T nu"]) -> Float[Array, "R nx nx"]:
     """Prior second moment E x xᵀ, about 0, of initial states.
 
-    After a fit it is the covariance of the states over the training data. Before a fit, when that
-    is 1, it is the second moment of the states that the input excites from rest; 0 if the model
-    diverges.
+    After a fit it is the covariance of the states over the training data. Before a fit, when
+    ``state_covariance`` is the identity, it is the second moment of the states that the input
+    excites from rest, or 0 if the model diverges.
     """
     W = model.weights()
     P = to_float64(W.state_covariance)
@@ -193,8 +193,8 @@ class _Prior(NamedTuple):
     """Prior term v |white x0|² beside the squared errors; their variance v is estimated with x0."""
 
     white: Float[Array, "R nx nx"]
-    spread: Float[Array, "R nx nx"]  # its inverse
-    variance: Float[Array, " R"]  # the largest, from the errors at rest
+    spread: Float[Array, "R nx nx"]  # inverse of ``white``
+    variance: Float[Array, " R"]  # upper limit of v, from the errors of a start at rest
     counted: Int[Integers, " R"]  # number of errors
 
 
@@ -208,7 +208,7 @@ def _fitted_start(
     *,
     settled: bool = False,
 ) -> Trajectory:
-    """Trajectory from the initial state that minimises |weight (y_hat - y)|², and the prior.
+    """Trajectory from the initial state that minimises |weight (y_hat - y)|² plus the prior.
 
     Gauss-Newton from ``best``; a step that does not lower the cost is quartered. The weight of the
     prior falls from its largest value in the first steps, unless the search begins ``settled``.
@@ -236,7 +236,7 @@ def _fitted_by_torch(
     prior: _Prior,
     passes: int,
 ) -> Trajectory:
-    """Search like ``fit_starts``, for all records at once."""
+    """The search of ``fit_starts``, for all records at once."""
     x0, v = to_float64(best.x[:, 0]).copy(), np.zeros(len(u))
     seen = SEEN * to_float64(weight.abs().amax(dim=(1, 2)))
     tolerance = max(TOLERANCE, torch.finfo(u.dtype).eps)
@@ -254,7 +254,7 @@ def _fitted_by_torch(
                 L[r], squares[r], x0[r], white, spread, variance, counted, passes, seen[r]
             )
         cost = before = costs(x0, squares)
-        # A step that should hardly lower the cost is not worth a trial.
+        # A step with too small a predicted decrease of the cost is not tried.
         waiting = promised > tolerance * cost  # False for NaN
         for _ in range(HALVINGS):
             if not waiting.any():
@@ -296,14 +296,14 @@ def _factor(
     errors: Float[Tensor, "R T ny"],
     at: Trajectory,
 ) -> tuple[Float[Array, "R n n"], Booleans]:
-    """Factor L of L Lᵀ = Mᵀ M, M = [∂y/∂x0 | errors] weighted, and where M is finite."""
+    """Factor L of L Lᵀ = Mᵀ M, with weighted M = [∂y/∂x0 | errors], and if M is finite."""
     none, found = torch.zeros(0, dtype=torch.int64), u.new_zeros(len(u), W.nx + 1, W.nx + 1)
     for block in Linearisation(W, u, at).rows(none, initial_state=True, faded=FADED):
         rows = weight[:, block.time].unsqueeze(-1) * block.rows
         part = torch.cat([rows, errors[:, block.time].unsqueeze(-1)], dim=-1).flatten(1, 2)
         stacked = torch.cat([found, part], dim=1)
         finite = torch.isfinite(stacked).all(dim=2).all(dim=1)[:, None, None]
-        # LAPACK may not end on NaN.
+        # LAPACK may never return if an entry is NaN.
         R = torch.linalg.qr(torch.where(finite, stacked, 0.0), mode="r").R
         found = torch.where(finite, R, torch.nan)
     L = to_float64(found.mT)

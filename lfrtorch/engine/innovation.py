@@ -11,9 +11,9 @@ prediction ŷ of the next output is the output of an NL-LFR with the inputs u an
     x+ = (A - K Cy) x + (Bu - K Dyu) u + K y + (Bw - K Dyw) w
     ŷ  = Cy x + Dyu u + Dyw w
 
-Neither ŷ nor z has feedthrough from y: those columns are zero, and a fit holds them. The two forms
-have the same number of parameters, and each follows from the other. An entry of A, Bu or Bw that is
-held in the system is an equation between entries of the predictor and of K.
+Neither ŷ nor z has feedthrough from y: these columns are zero, and a fit holds them. The two forms
+have the same number of parameters, and each determines the other. If an entry of A, Bu or Bw is
+held in the system, an equation between entries of the predictor and of K is held.
 
 References:
     Ljung, "System Identification: Theory for the User", 2nd ed., 1999, section 4.3.
@@ -35,8 +35,8 @@ from lfrtorch.engine.held import TIED, past_outputs
 def predictor_cell(cell: LFRCell, K: Float[Tensor, "nx ny"]) -> LFRCell:
     """The one-step predictor of a cell with the innovation gain K: its inputs are u, then y.
 
-    Entries of the output equations that the cell holds, the predictor holds as well. Held entries
-    of A, Bu and Bw become ``of_system`` of the predictor.
+    The predictor also holds the held entries of the cell's output equations. Held entries of A, Bu
+    and Bw become ``of_system`` of the predictor.
     """
     with torch.no_grad():
         K = K.to(cell.A)
@@ -75,12 +75,12 @@ def split_predictor(cell: LFRCell) -> tuple[LFRCell, Float[Tensor, "nx ny"]]:
 
 
 def _like(cell: LFRCell, nu: int) -> LFRCell:
-    """A cell with other inputs and the matrices that both forms share; the static map is a copy."""
+    """A cell with ``nu`` inputs, the matrices that both forms share, and a copy of the map."""
     A = cell.A
     sizes = nu, cell.ny, cell.nx, cell.nz, cell.nw
     found = LFRCell(*sizes, deepcopy(cell.static), device=A.device, dtype=A.dtype, random=False)
     for name in ("Cz", "Cy", "Dyw", "state_covariance"):
         getattr(found, name).copy_(getattr(cell, name))
-    for name in {*Matrices._fields} - {*TIED}:  # frozen ones stay so
+    for name in {*Matrices._fields} - {*TIED}:  # frozen matrices stay frozen
         found.get_parameter(name).requires_grad_(cell.get_parameter(name).requires_grad)
     return found

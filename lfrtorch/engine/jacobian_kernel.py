@@ -1,9 +1,9 @@
 """Rows of the Jacobian in machine code.
 
-The sensitivities S(k+1) = F(k) S(k) + G(k) go from sample to sample, and the rows
-dy(k)/dθ = H(k) S(k) + E(k) are written on the way; no S is stored over time. Each job has one
-record and some of the columns.
-``sensitivity`` has the equations, and the same computation in torch.
+The sensitivities S(k+1) = F(k) S(k) + G(k) are computed sample by sample. The rows
+dy(k)/dθ = H(k) S(k) + E(k) are written on the way, and no S is stored over time. Each job has one
+record and some of the columns. ``sensitivity`` explains the equations, and has the same computation
+in torch.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from lfrtorch.engine.simulation_kernel import matrices
 from lfrtorch.maps.machine_code import call_slope, prepared
 
 _TILE = 4
-"""Sums run over a multiple of this number of terms, filled up with zeros."""
+"""The number of terms of a sum is filled up with zeros to a multiple of this number."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -45,7 +45,7 @@ def record_rows(
     sizes, weights, code, u, x, z, w, t0,
     x_entries, z_entries, y_entries, static, c0, c1, S, rows,
 ):  # fmt: skip
-    """Write columns c0 to c1 of the rows of a record from sample t0, and take S to the block's end.
+    """Write columns c0 to c1 of a record's rows from sample t0, and advance S to the block's end.
 
     Entries are those of ``sensitivity.DirectTerms``.
 
@@ -65,8 +65,8 @@ def record_rows(
     s1 = max(min(first + len(static), c1), s0)
     whole = s1 - s0 == P > 0  # this job has all weights of the map, in their order
     # [S(k+1); dy(k)] = M(k) X(k) with X = [S; direct terms of w] and M = [F Bw; H Dyw], padded with
-    # zeros to even rows and a multiple of ``_TILE`` columns. Arrays stay in place: to hand them on
-    # takes as long as a product.
+    # zeros to an even number of rows and a multiple of ``_TILE`` columns. Arrays are reused in
+    # place, as passing them on takes as long as a product.
     width, tall, depth = _padded(c1 - c0, 8), _padded(nx + ny, 2), _padded(nx + nw, _TILE)
     M, X, Y = np.zeros((tall, depth)), np.zeros((depth, width)), np.empty((tall, width))
     J, by_weight, v = np.zeros((nw, nz)), np.zeros((nw, P)), np.empty(nx + nu + nw)
@@ -95,7 +95,7 @@ def record_rows(
         _add_slope(A, J, Cz, 0, M)
         _add_slope(Cy, J, Cz, nx, M)
         _product(M, X, Y)
-        # Scalars are stored well before vector instructions load them: these would wait.
+        # Scalars are stored well before vector instructions load them, which would wait otherwise.
         for i in range(nx):
             for c in range(width):
                 X[i, c] = Y[i, c]
@@ -130,7 +130,7 @@ def signals(x, u, w, t, v):
         v[nx + nu + i] = w[t, i]
 
 
-# Loops instead of slices and masks, which take numba seconds to compile.
+# Loops are used instead of slices and masks, which numba takes seconds to compile.
 @njit(nogil=True)
 def copy_to(source, target, column):
     """Copy source to target[:, column:]."""
@@ -168,7 +168,7 @@ def _between(entries, c0, c1):
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"})
 def _product(M, X, out):
-    """Out = M X, two rows and four products at a time: the factors stay in registers."""
+    """Out = M X, two rows and four products at a time, so that factors stay in registers."""
     for i in range(0, M.shape[0], 2):
         for j in range(0, M.shape[1], 4):
             a0, a1, a2, a3 = M[i, j], M[i, j + 1], M[i, j + 2], M[i, j + 3]

@@ -32,7 +32,7 @@ from lfrtorch.maps.machine_code import call_slope, call_value, prepared
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def filter_record(u, y, sizes, weights, code, G, x, U):
-    """Filter all samples: x and U go to the end, and log p(y) is returned; NaN in y is missing.
+    """Filter all samples: advance x and U to the end, and return log p(y); NaN marks missing y.
 
     Shape:
         u: (T, nu), y: (T, ny), G: (ny + nx, ny + nx), x: (nx,), U: (nx, nx).
@@ -63,7 +63,7 @@ def correct_sample(u, y, sizes, weights, code, G, x, U, w_hat):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def advance_sample(u, sizes, weights, code, M, known, w_hat, x, U):
-    """Take x and U to the next sample, from the result of ``correct_sample``."""
+    """Advance x and U to the next sample, from the result of ``correct_sample``."""
     A, Bu, Bw, Cz, Dzu, _, _, _, phi = matrices(sizes, weights)
     nx, nw = Bw.shape
     x_next, F, by_x = np.empty(nx), np.empty((nx, nx)), np.empty((nw, nx))
@@ -150,7 +150,7 @@ def _static(Cz, x, Dzu, u, nw, phi, code):
 
 @njit(nogil=True, error_model="numpy")
 def _slope(constant, B, J, Cz, by_x, out):
-    """Out = constant + B J Cz; by_x is a place for J Cz."""
+    """Out = constant + B J Cz; by_x is scratch space for J Cz."""
     for q in range(len(by_x)):
         for n in range(Cz.shape[1]):
             by_x[q, n] = 0.0

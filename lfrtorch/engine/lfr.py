@@ -16,12 +16,12 @@ from lfrtorch.engine.differentiable import Simulation
 from lfrtorch.engine.simulation import Trajectory, simulate, steady_state
 
 _UNCOMPILED: list[Any] = []
-"""Simulation as ``torch.compile`` calls it, made at the first use: the compiler takes a second to
-import."""
+"""The simulation as ``torch.compile`` calls it, made at the first use, as the import of the
+compiler takes a second."""
 
 
 class LFR(nn.Module):
-    """NL-LFR model over time: simulates the cell and differentiates by the adjoint recurrence.
+    """NL-LFR model over time, which simulates the cell; gradients are by the adjoint recurrence.
 
     Args:
         cell: the model equations and their weights.
@@ -56,8 +56,8 @@ class LFR(nn.Module):
 
         Args:
             u: input.
-            x0: initial state; a first guess in periodic steady state. Default: zero.
-            start: ``"periodic"`` for the periodic steady state; otherwise from ``x0``.
+            x0: initial state, or a first guess of the periodic steady state. Default: zero.
+            start: ``"periodic"`` for the periodic steady state; otherwise the start is ``x0``.
             guess: states of a nearby trajectory, which may save time.
 
         Shape:
@@ -93,18 +93,18 @@ class LFR(nn.Module):
         start: Start = "zero",
         return_state: bool = False,
     ) -> Tensor | tuple[Tensor, Tensor]:
-        """Simulated output; ``backward`` costs one adjoint recurrence (no second derivatives).
+        """Simulated output; ``backward`` is one adjoint recurrence, without second derivatives.
 
         Args:
             u: input.
-            x0: initial state; a first guess in periodic steady state. Default: zero.
-            start: ``"periodic"`` for the periodic steady state; otherwise from ``x0``.
-            return_state: also return the state after the last sample, (R, nx), where a next part of
-                the signals goes on.
+            x0: initial state, or a first guess of the periodic steady state. Default: zero.
+            start: ``"periodic"`` for the periodic steady state; otherwise the start is ``x0``.
+            return_state: also return the state after the last sample, (R, nx), from which a
+                simulation of the next samples can go on.
 
         Raises:
-            ValueError: signals of other sizes, dtype or device than the weights; a state that is
-                asked of a periodic steady state.
+            ValueError: signals of other sizes, dtype or device than the weights, or
+                ``return_state`` with a periodic steady state.
         """
         if "torch._dynamo" in sys.modules:  # torch.compile leaves this layer as it is
             if not _UNCOMPILED:
@@ -121,8 +121,8 @@ class LFR(nn.Module):
         if torch.onnx.is_in_onnx_export() or torch.compiler.is_compiling():
             raise InputError(
                 "an LFR runs in machine code, which torch.export and torch.onnx.export cannot "
-                "follow;\nlfrtorch.export.write(model, 'onnx', FOLDER) writes a lfrtorch.Model, "
-                "which has such a layer."
+                "trace;\nlfrtorch.export.write(model, 'onnx', FOLDER) writes the lfrtorch.Model "
+                "that has this layer."
             )
         if self.cell.autocast:
             u, x0 = self.cell.uncast(u, x0)
@@ -148,7 +148,7 @@ class LFR(nn.Module):
         return y, end
 
     def _stepped(self, u: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Output and last state by torch alone, sample by sample."""
+        """Output and last state, computed by torch alone, sample by sample."""
         self.cell.check()
         outputs = []
         for u_k in u.unbind(1):
@@ -160,4 +160,4 @@ class LFR(nn.Module):
     def _check_start(start: Start) -> None:
         check_start(start, "simulation")
         if start in ("estimated", "measured"):
-            raise InputError(f"start='{start}' needs a record's output: Model.simulate.")
+            raise InputError(f"start='{start}' needs measured outputs; use Model.simulate(record).")

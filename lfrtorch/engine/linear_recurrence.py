@@ -1,7 +1,7 @@
 """Linear recurrences s(k+1) = F(k) s(k) + g(k), for many columns at once.
 
-Newton steps over a trajectory, start states and periodic boundaries are such recurrences. Compiled
-code serves the CPU, and ``scan``, parallel in time, any other device.
+Newton steps over a trajectory, start states and periodic boundaries lead to such recurrences. On
+the CPU compiled code is used; other devices use ``scan``, which is parallel in time.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 from lfrtorch._support.threads import has_kernels, spread, to_numpy
 
 NOTHING = 1e-30
-"""Magnitude below which entries are set to 0; states have unit size."""
+"""Magnitude below which entries are set to 0; states are of unit size."""
 
 
 def linear_recurrence(
@@ -48,7 +48,7 @@ def _recur(r, F, g, s):
 
 @njit(nogil=True)
 def flush(s):
-    """Set faded entries to 0: on denormal numbers a recurrence is a hundred times slower."""
+    """Set decayed entries to 0: with denormal numbers a recurrence is a hundred times slower."""
     for i in range(s.shape[0]):
         for c in range(s.shape[1]):
             if abs(s[i, c]) < NOTHING:
@@ -60,8 +60,8 @@ def scan(
 ) -> Float[Tensor, "R T+1 n m"]:
     """The recurrence in about 3 √T batched products: chunks of √T steps next to each other.
 
-    Every chunk runs from a zero state, together with its transition matrices; one loop over the
-    chunks finds their initial states; the response to these is added in each chunk.
+    Every chunk is computed from a zero state, together with its transition matrices. One loop over
+    the chunks then computes their initial states, and the response to these is added.
     """
     R, T, n, m = g.shape
     steps = max(1, math.isqrt(T))

@@ -13,7 +13,7 @@ from lfrtorch.engine.weights import Weights
 from lfrtorch.maps.linearised import linearise_map
 
 PASS = 1 << 14
-"""Most samples, of all records together, that are linearised in one pass."""
+"""Largest number of samples, of all records together, that are linearised in one pass."""
 
 
 class Linearised(NamedTuple):
@@ -42,8 +42,8 @@ def static_slope(
 def linearise_at(W: Weights, J: Float[Tensor, "R T nw nz"]) -> Linearised:
     """F = A + Bw J Cz and H = Cy + Dyw J Cz, with J = ∂w/∂z.
 
-    Both are linear in J: its entries times one constant matrix give [F; H]. That is one large
-    product, twenty times faster than small ones at every sample.
+    Both are linear in J: its entries times a constant matrix give [F; H]. This single large product
+    is twenty times faster than small products at every sample.
     """
     # products[(q, j), (i, l)] = [Bw; Dyw][i, q] Cz[j, l]
     left = torch.cat([W.Bw, W.Dyw], dim=-2)
@@ -54,7 +54,7 @@ def linearise_at(W: Weights, J: Float[Tensor, "R T nw nz"]) -> Linearised:
 
 
 def fed_back(M: Any, J: Any) -> tuple[Any, Any, Any, Any]:
-    """A, B, C and D of the linear block of ``Matrices`` or ``Weights`` with w = J z about it."""
+    """A, B, C and D of ``Matrices`` or ``Weights`` whose loop is closed by w = J z."""
     Bw, Dyw = M.Bw @ J, M.Dyw @ J
     return M.A + Bw @ M.Cz, M.Bu + Bw @ M.Dzu, M.Cy + Dyw @ M.Cz, M.Dyu + Dyw @ M.Dzu
 
@@ -62,7 +62,7 @@ def fed_back(M: Any, J: Any) -> tuple[Any, Any, Any, Any]:
 def spectral_radius(matrices: Float[Tensor, "*axes n n"]) -> Float[Tensor, "*axes"]:
     """Largest magnitude of the eigenvalues of each matrix; NaN if an entry is not finite.
 
-    Some builds of LAPACK crash the process on such a matrix, so they never see it.
+    Some builds of LAPACK crash the process on such a matrix, so it is never passed to LAPACK.
     """
     finite = torch.isfinite(matrices).all(dim=-1).all(dim=-1)
     radii = torch.linalg.eigvals(torch.where(finite[..., None, None], matrices, 0.0)).abs().amax(-1)

@@ -20,12 +20,12 @@ from lfrtorch.engine.linearised import linearise, spectral_radius
 from lfrtorch.engine.weights import Weights
 
 MAX_NEWTON = 20
-"""Iterations after which Newton's method has failed; from a nearby trajectory it needs 3 or 4."""
+"""Iterations after which Newton's method counts as failed; near a solution it needs 3 or 4."""
 
 _UPDATE_ROUNDING = 1.0
-"""The states count as found after an update below this many √eps, relative to 1 + max |x|.
+"""The states have converged after an update below this many √eps, relative to 1 + max |x|.
 
-Convergence is quadratic, so the error left is about eps: the rounding of the loop over time.
+Convergence is quadratic, so the remaining error is about eps, as that of a loop over time.
 """
 
 
@@ -62,7 +62,8 @@ def newton_states(
         z, w = W.internal(u, x[:, :-1])
         defect = x[:, :-1] @ W.A.mT + driven + w @ W.Bw.mT - x[:, 1:]
         gap = (x[:, -1] if periodic else x0) - x[:, 0]
-        # `defect` is f(x(k), u(k)) - x(k+1), and `gap` that of the boundary: both 0 when found.
+        # `defect` is f(x(k), u(k)) - x(k+1), and `gap` is the error of the boundary condition. Both
+        # are 0 at the solution.
         update, transition = (_closed if periodic else _open)(linearise(W, z).F, defect, gap)
         x = x + update
         change, size = (signal.abs().amax(dim=(1, 2)) for signal in (update, x))
@@ -77,7 +78,7 @@ def newton_states(
 def _open(
     F: Float[Tensor, "R T nx nx"], defect: Float[Tensor, "R T nx"], gap: Float[Tensor, "R nx"]
 ) -> tuple[Float[Tensor, "R T+1 nx"], Float[Tensor, "R nx"]]:
-    """Solve d(k+1) = F(k) d(k) + defect(k) from d(0) = gap: all d and the last."""
+    """Solve d(k+1) = F(k) d(k) + defect(k) from d(0) = gap: all d, and the last d."""
     d = linear_recurrence(F, defect.unsqueeze(-1), gap.unsqueeze(-1)).squeeze(-1)
     return d, d[:, -1]
 
@@ -85,7 +86,7 @@ def _open(
 def _closed(
     F: Float[Tensor, "R T nx nx"], defect: Float[Tensor, "R T nx"], gap: Float[Tensor, "R nx"]
 ) -> tuple[Float[Tensor, "R T+1 nx"], Float[Tensor, "R nx nx"]]:
-    """Solve the same from d(0) = d(T) + gap: all d, and the transition Φ over the whole record.
+    """Solve that recurrence with d(0) = d(T) + gap: all d, and the transition Φ over the record.
 
     The solution is d(k) = Φ(k) d(0) + p(k). One recurrence has the columns [Φ(k) p(k)], and the
     boundary gives (I - Φ) d(0) = p(T) + gap.

@@ -21,10 +21,10 @@ from lfrtorch.engine.linearised import fed_back, static_slope
 from lfrtorch.engine.simulation import simulate
 
 _MAX_NEWTON = 50
-"""Most steps of Newton's method."""
+"""Largest number of steps of Newton's method."""
 
 HALVINGS = 30
-"""Most halvings of a step of Newton's method."""
+"""Largest number of halvings of a step of Newton's method."""
 
 _TOLERANCE = 1e-10
 """Largest |f(x, u) - x| at rest, relative to 1 + max |x| (states have unit rms)."""
@@ -34,7 +34,7 @@ SINGULAR = 1e-12
 in any state."""
 
 _SETTLING = 1000
-"""Samples of the simulation that approaches an equilibrium, where Newton's method finds none."""
+"""Number of simulated samples before a second try of Newton's method, if the first one fails."""
 
 
 class StateSpace(NamedTuple):
@@ -91,7 +91,7 @@ def equilibrium(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nx"] 
 
 
 def resting_input(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nu"] | None:
-    """The input next to u under which an integrating model is at rest, or None."""
+    """The input nearest to u under which an integrating model is at rest, or None."""
     found = _rest(cell, u, u.new_zeros(cell.nx), inputs=cell.nu)
     return None if found is None else found[0]
 
@@ -108,7 +108,7 @@ def resting_near(
 def _rest(
     cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"], *, inputs: int = 0
 ) -> tuple[Float[Tensor, " nu"], Float[Tensor, " nx"]] | None:
-    """Input and state at rest, by Newton's method in the state, and in the inputs if asked to."""
+    """Input and state at rest, by Newton's method in the state and the first ``inputs`` inputs."""
     identity = torch.eye(cell.nx, dtype=u.dtype)
     gap = cell(u, x)[1] - x
     for _ in range(_MAX_NEWTON):

@@ -1,7 +1,7 @@
-"""Starts of records: five objects, each with its initial state.
+"""Starts of records: five objects that define initial states.
 
-``STARTS`` has one for each name of ``Record.start``. Signals are normalised, of records with the
-same start. Simulations and fits ask the object, and never compare names.
+``STARTS`` has an object for each name of ``Record.start``. Signals are normalised, and of records
+with the same start. Simulations and fits call the object, and never compare names.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class AtRest:
         y: Float[Tensor, "R T ny"],
         x0: Float[Tensor, "R nx"] | None,
     ) -> Float[Tensor, "R nx"] | None:
-        """Initial states independent of all parameters; None for rest or without any."""
+        """Initial states that depend on no parameter; None at rest, or if there are none."""
         return None
 
     def solved(
@@ -39,11 +39,11 @@ class AtRest:
         weight: Float[Tensor, "R T ny"],
         near: Float[Tensor, "R nx"] | None = None,
     ) -> Float[Tensor, "R nx"] | None:
-        """Initial states estimated by a model from the outputs, near given ones; None if known."""
+        """Initial states that a model estimates from the outputs; None if they are known."""
         return None
 
     def guess(self, model: Numbers, u: Tensor, y: Tensor, weight: Tensor) -> Tensor:
-        """Initial guess of a fit for initial states that are parameters."""
+        """First guess of a fit for initial states that are parameters."""
         raise NotImplementedError
 
     def trajectory(
@@ -66,7 +66,7 @@ class Given(AtRest):
 
 
 class Measured(AtRest):
-    """Start ``"measured"``: the state determined by the first output, whose equation is held."""
+    """Start ``"measured"``: the first output determines the state; its equation is held."""
 
     def known(self, model: Numbers, u: Tensor, y: Tensor, x0: Tensor | None) -> Tensor | None:
         """State that has the first output."""
@@ -109,7 +109,7 @@ STARTS: dict[str, AtRest] = {
     "zero": AtRest(), "given": Given(), "measured": Measured(), "estimated": Estimated(),
     "periodic": Periodic(),
 }  # fmt: skip
-"""Starts by the names that records have for them."""
+"""Starts by their names in ``Record.start``."""
 
 
 def begun(name: str, model: Numbers, u: Tensor, y: Tensor, weight: Tensor) -> Trajectory:

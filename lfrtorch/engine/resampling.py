@@ -1,7 +1,7 @@
 """A cell at another sampling rate: u and w are held over a sample, as in the original.
 
-Let w = K z + δw, K the slope of the static map at rest. The linear part, from u and δw, is then a
-continuous system with held inputs::
+Let w = K z + δw, where K is the slope of the static map at rest. The linear system with the inputs
+u and δw is then a continuous system whose inputs are held::
 
     exp(T [Ac Bc]) = [A B]        so that exp(T' [Ac Bc]) = [A B]^(T'/T)
           [0  0 ]    [0 1]                      [0  0 ]    [0 1]
@@ -22,7 +22,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
 
-_ROUNDING = 1e-6  # error of the logarithm, relative
+_ROUNDING = 1e-6  # largest relative error of the logarithm
 
 
 def resampled_cell(cell: LFRCell, K: Float[Array, "nw nz"], ratio: float) -> LFRCell:

@@ -2,23 +2,23 @@
 
 A weight changes the output in two ways. The direct way is its own equation, where it multiplies a
 signal. The indirect way is the next state, whose change the model propagates from sample to sample.
-The derivative S(k) of the state with respect to all parameters is therefore simulated along with
-the model, by the model linearised at every sample. That is a linear recurrence with one column for
-each parameter, and the output's derivative follows from it. A product of this Jacobian with one
+So the derivative S(k) of the state with respect to all parameters is simulated along with the
+model, by the model linearised at every sample. This is a linear recurrence with one column for each
+parameter, and it determines the derivative of the output. A product of this Jacobian with one
 vector needs one column: forwards in time for J dθ, backwards in time for Jᵀ e (backpropagation
 through time).
 
-The model is linear in its matrices, v = [x; u; w]::
+The model is linear in its matrices; with v = [x; u; w]::
 
     x+ = [A Bu Bw] v      z = [Cz Dzu 0] v      y = [Cy Dyu Dyw] v      w = f(z; φ)
 
-The direct terms of a parameter are entries of v, or derivatives of f for those of the static map.
-They stand in G and E; F and H are the linearised model::
+The direct terms of a parameter are entries of v or, for parameters of the static map, derivatives
+of f. They are the entries of G and E. F and H are the linearised model::
 
     S(k+1) = F(k) S(k) + G(k),    dy(k)/dθ = H(k) S(k) + E(k)
 
 ``rows`` computes all columns, ``tangent`` one direction dθ, ``adjoint`` one combination of outputs.
-They pass over time in blocks, so that memory does not grow with the length of a record.
+They process time in blocks, so memory does not grow with the length of a record.
 """
 
 from __future__ import annotations
@@ -44,23 +44,23 @@ from lfrtorch.engine.weights import DirectTerms, Weights
 from lfrtorch.maps.linearised import LinearisedMap, linearise_map
 
 _FADED = 1e-18
-"""Part of an initial state below which it is forgotten."""
+"""An initial state counts as forgotten when this part of it is left."""
 
 BLOCK = 8192
-"""Most samples, of all records together, in a block of rows on the CPU."""
+"""Largest number of samples, of all records together, in a block of rows on the CPU."""
 
 _BLOCK_BYTES = 1 << 24
-"""Most bytes in a block of rows on the CPU: rows that leave the cache cost up to 15 % more time."""
+"""Largest size of a block of rows on the CPU: rows beyond the cache take up to 15 % more time."""
 
 KEPT = 1 << 16
-"""Most samples for which the slopes of a compiled map are kept over all passes of an iteration."""
+"""Largest number of samples for which slopes of a compiled map are kept during an iteration."""
 
 MANY_STATES = 8
 """Number of states from which ``blocked_rows`` is faster than ``jacobian_rows``."""
 
 
 class Rows(NamedTuple):
-    """Rows dy/dθ of some records and samples, with columns of the initial state and spare ones."""
+    """Rows dy/dθ of some records and samples; initial states and spare columns come last."""
 
     records: slice
     time: slice
@@ -88,11 +88,11 @@ class Linearisation:
     """The model linearised along a trajectory.
 
     Args:
-        model: the numbers; those of parameters with ``requires_grad=False`` are no part of θ.
+        model: the numbers; numbers of parameters with ``requires_grad=False`` are not part of θ.
         u, trajectory: input and signals of this model.
-        periodic: the initial state is the end state, for all parameters. Otherwise it does not
-            depend on them.
-        every: all numbers are θ.
+        periodic: True if the initial state equals the end state, whatever the parameters are.
+            Otherwise the initial state does not depend on the parameters.
+        every: True if all numbers are part of θ, including frozen ones.
     """
 
     @torch.no_grad()
@@ -124,7 +124,7 @@ class Linearisation:
 
     @property
     def state(self) -> Float[Tensor, "R nx"]:
-        """Zeros."""
+        """Zero states of all records."""
         return self.u.new_zeros(len(self.u), self.weights.nx)
 
     def columns(self, kept: Int[Tensor, " K"]) -> DirectTerms:
@@ -147,14 +147,14 @@ class Linearisation:
         out: Float[Tensor, "R T ny columns"] | None = None,
         faded: float = 0.0,
     ) -> Iterator[Rows]:
-        """Rows of dy/dθ with the initial state held, block by block.
+        """Rows of dy/dθ for a fixed initial state, block by block.
 
         Args:
-            kept: parameters that get a column, ascending.
-            initial_state: nx columns for the initial state follow.
-            spare: columns without a value at the end of the rows, for the caller to fill.
-            out: array for all rows, to keep them; a block is then all samples of its records.
-            faded: derivatives of the state below which the rest of a record is left out.
+            kept: parameters that get a column, in ascending order.
+            initial_state: True if nx columns for the initial state follow.
+            spare: number of uninitialised columns at the end of the rows, for the caller to fill.
+            out: array that keeps all rows; a block then has all samples of its records.
+            faded: the rest of a record is left out when the derivatives of the state are smaller.
         """
         columns, W = self.columns(kept), self.weights
         (R, T), nx, ny = self.u.shape[:2], W.nx, W.ny
@@ -163,13 +163,13 @@ class Linearisation:
             row = ny * (width + spare) * self.u.element_size()
             samples = min(BLOCK, max(1, _BLOCK_BYTES // max(1, row)))
         Phi = self.u.new_empty(R, nx, nx * initial_state)
-        # Blocks do not depend on the number of threads, and so neither do sums over them.
+        # Blocks, and so the sums over them, do not depend on the number of threads.
         together = 1 if self._compiled else R
         for records in _slices(R, max(together, samples // T)):
             S = self.u.new_zeros(records.stop - records.start, nx, width)
             if initial_state:
                 S[:, :, len(kept) :] = torch.eye(nx).to(S)
-            # The kernel writes to contiguous memory: of `out` only whole records are that.
+            # The kernel writes to contiguous memory: only whole records of `out` are contiguous.
             length = T if out is not None else max(1, samples // len(S))
             for time in _slices(T, length):
                 if out is None:
@@ -180,7 +180,7 @@ class Linearisation:
                 S = write(records, time, columns, S, rows)
                 if initial_state and self.periodic and time.stop == T:
                     Phi[records] = S[:, :, len(kept) :]
-                    # Once it has faded, later blocks are not needed.
+                    # Blocks after the initial state has decayed are not needed.
                     if records.stop == R and Phi.abs().amax() >= _FADED:
                         self._known_transition = Phi, self._times
                 yield Rows(records, time, rows, S)
@@ -190,7 +190,7 @@ class Linearisation:
     def tangent(
         self, d_theta: Float[Tensor, " P"], d_x0: Float[Tensor, "R nx"] | None = None
     ) -> Float[Tensor, "R T ny"]:
-        """Change dy of the output by dθ and by the initial state, which dθ implies if periodic."""
+        """Change dy of the output by dθ and d_x0; if periodic, dθ determines the initial state."""
         return self.tangent_with_end(d_theta, d_x0)[0]
 
     @torch.no_grad()
@@ -241,7 +241,7 @@ class Linearisation:
     def adjoint(
         self, e: Float[Tensor, "R T ny"], end: Float[Tensor, "R nx"] | None = None
     ) -> Adjoint:
-        """Gradient of Σ e(k) · y(k), and of end · x(T) unless a record is periodic."""
+        """Gradient of Σ e(k) · y(k), plus end · x(T) unless the records are periodic."""
         W, t = self.weights, self.trajectory
         end = self._periodic_costate(e) if self.periodic else self.state if end is None else end
         theta, by_u = 0.0, []
@@ -250,7 +250,7 @@ class Linearisation:
             e_block = e[:, time]
             costates = self._costates(block, e, end)
             ahead, end = costates[:, 1:], costates[:, 0]
-            # λ(k+1) and e(k) are the weights of x(k+1) and y(k): pass them back to w, z and θ.
+            # λ(k+1) and e(k) are the derivatives by x(k+1) and y(k): pass them on to w, z and θ.
             d_w = ahead @ W.Bw + e_block @ W.Dyw
             d_z = _apply(block.static.J.mT, d_w)
             x, u, w = t.x[:, :-1][:, time], self.u[:, time], t.w[:, time]
@@ -266,8 +266,8 @@ class Linearisation:
     def _periodic_costate(self, e: Float[Tensor, "R T ny"]) -> Float[Tensor, "R nx"]:
         """Costate λ(T) = λ(0) of a periodic steady state.
 
-        The costate λ(0) is the effect of the initial state on the outputs. Samples after that
-        effect has faded are not needed.
+        λ(0) is the effect of the initial state on the outputs. Samples after this effect has
+        decayed are not needed.
         """
         Phi, times = self._transition
         end = self.state
@@ -278,7 +278,7 @@ class Linearisation:
 
     @property
     def _transition(self) -> tuple[Float[Tensor, "R nx nx"], list[slice]]:
-        """Transition Φ over a whole record, and the blocks in which an initial state fades."""
+        """Transition Φ over a whole record, and the blocks until an initial state has decayed."""
         if self._known_transition is not None:
             return self._known_transition
         R, nx = self.state.shape
@@ -308,7 +308,7 @@ class Linearisation:
 
     @cached_property
     def _whole(self) -> _Block | None:
-        """Linearised model at all samples, kept from one pass to the next if samples are few."""
+        """Linearised model at all samples, kept between passes if there are few samples."""
         R, T = self.u.shape[:2]
         return self._at(slice(0, R), slice(0, T)) if self._few else None
 
@@ -396,6 +396,6 @@ def _slices(length: int, size: int) -> Iterator[slice]:
 def fixed_point(
     transition: Float[Tensor, "R nx nx"], end: Float[Tensor, "R nx m"]
 ) -> Float[Tensor, "R nx m"]:
-    """Solution of S = Φ S + end: the initial state of a period; not finite if there is none."""
+    """Solution of S = Φ S + end, the initial state of a period; not finite without a solution."""
     identity = torch.eye(end.shape[1]).to(end)
     return torch.linalg.solve_ex(identity - transition, end).result

@@ -18,29 +18,29 @@ from lfrtorch.engine.simulation_kernel import simulate_records
 from lfrtorch.engine.weights import Weights
 
 Numbers = LFRCell | Weights
-"""A model to simulate: a cell as it is, or its numbers."""
+"""A model to simulate: a cell, or the vector of its numbers."""
 
 PERIODIC_TOLERANCE = 1e-10
 """Largest |x(T) - x(0)| that counts as periodic, relative to 1 + max |x| (states have unit rms)."""
 
 _PERIODIC_ROUNDING = 100.0
-"""Largest |x(T) - x(0)| in rounding errors; it decides in float32."""
+"""The same limit in rounding errors; it is the larger one in float32."""
 
 _MET_ROUNDING = 4.0
-"""Rounding errors within which the states of two trajectories have met."""
+"""Distance, in rounding errors, at which the states of two trajectories count as equal."""
 
 _SETTLING_PERIODS = 3
-"""Periods simulated forward before Newton's method takes over; a well damped model needs one."""
+"""Number of periods simulated before Newton's method begins; a well damped model needs one."""
 
 _CLOSER = 1e-2
-"""Relative accuracy of a predicted change up to which the monodromy is kept. Newton's method begins
-below the same relative change of the states."""
+"""Relative accuracy of a predicted change up to which the monodromy is kept. Newton's method also
+begins once the relative change of the states is below this number."""
 
 _MAX_PERIODS = 30
-"""Most passes over the record in search of the periodic steady state."""
+"""Largest number of passes over the record in search of the periodic steady state."""
 
 _EXPLODED = 10.0
-"""Growth of the states since the first pass after which an unstable trajectory is lost."""
+"""Growth of the states since the first pass at which an unstable trajectory counts as diverged."""
 
 
 class Trajectory(NamedTuple):
@@ -66,9 +66,9 @@ def simulate(
 ) -> Trajectory:
     """Trajectory from the state ``x0``, by default 0; infinite or NaN samples if it diverges.
 
-    On the CPU all maps but the user's modules run in machine code. User modules and other devices
-    use Newton's method over the whole trajectory, from the states ``guess`` of a nearby one.
-    Records for which that fails are simulated step by step.
+    On the CPU all maps except modules of the user run in machine code. User modules and other
+    devices use Newton's method over the whole trajectory; ``guess`` has the states of a nearby
+    trajectory. Records for which Newton's method fails are simulated step by step.
     """
     W = model.weights()
     if W.layout.compiled:
@@ -85,7 +85,7 @@ def simulate(
 def simulate_near(
     model: Numbers, u: Float[Tensor, "R T nu"], x0: Float[Tensor, "R nx"], near: Trajectory
 ) -> Trajectory:
-    """Simulate as ``simulate`` does, up to where a trajectory from another initial state is met."""
+    """Simulate until the states meet those of ``near``, from another start, and copy its rest."""
     W = model.weights()
     if W.layout.compiled:
         return _compiled(
@@ -109,13 +109,12 @@ def steady_state(
 ) -> Trajectory:
     """Trajectory with x(T) = x(0): the response to the periodic repetition of ``u``.
 
-    In machine code the record is simulated again and again, each time from its end state, until end
+    In machine code the record is simulated repeatedly, each time from its end state, until end
     state and initial state agree. After a few passes Newton's method on x(T) - x(0) takes over.
     Other cells try Newton's method over the whole trajectory first. The passes go on while the
-    trajectory is unstable, as near an equilibrium that it leaves. An unstable periodic solution, to
-    which no simulation would settle, counts as diverged unless the search begins on it: its record
-    has NaN samples. A record that has not settled after ``_MAX_PERIODS`` passes counts as diverged,
-    too.
+    trajectory is unstable, for example near an unstable equilibrium. No simulation settles to an
+    unstable periodic solution. So it counts as diverged, with NaN samples, unless the search begins
+    on it. A record that has not settled after ``_MAX_PERIODS`` passes also counts as diverged.
 
     Args:
         model: the model to simulate.
@@ -130,7 +129,7 @@ def steady_state(
         x = newton_states(W, u, x0, guess=states, periodic=True)
         if torch.isfinite(x).all():
             return signals(W, u, x)
-    # `settled` and `lost` tell for each record whether it is periodic, or will never be.
+    # `settled` marks records that are periodic, and `lost` those that will never be.
     identity = torch.eye(W.nx, dtype=u.dtype, device=u.device)
     eps = torch.finfo(u.dtype).eps
     tolerance = max(PERIODIC_TOLERANCE, _PERIODIC_ROUNDING * eps)
@@ -152,18 +151,18 @@ def steady_state(
         if passes < _SETTLING_PERIODS:
             closer = end
         else:
-            # It is kept where it predicted the change to two digits.
+            # The monodromy is kept for records whose change it predicted to two digits.
             miss = (end - x0 - foretold).abs().amax(dim=1)
             near = (miss <= _CLOSER * last) & (unstable | (last <= _CLOSER * size))
             if transition is None or not near[~settled & ~lost].all():
                 transition = monodromy(W, trajectory.z)
                 radius = spectral_radius(transition)
                 unstable = ~settled & ~(radius < 1.0)  # comparisons with NaN are False
-                # A linear model stays unstable, and a large radius makes states of rounding errors.
+                # A linear model stays unstable, and a large radius amplifies rounding errors.
                 lost |= unstable & ((W.nw == 0) | ~(radius < 1.0 / eps))
             lost |= unstable & (end.abs().amax(dim=1) > _EXPLODED * size)
             last = change
-            # x(T) = end + Φ d for the initial state x0 + d, and x(T) = x0 + d is wanted.
+            # From the initial state x0 + d, x(T) = end + Φ d to first order; it shall be x0 + d.
             gap = (end - x0).unsqueeze(-1)
             newton = x0 + torch.linalg.solve_ex(identity - transition, gap).result.squeeze(-1)
             closer = torch.where(unstable.unsqueeze(1), end, newton)

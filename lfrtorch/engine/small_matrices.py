@@ -1,6 +1,6 @@
-"""Decompositions of matrices of some ten numbers, in machine code.
+"""Decompositions of matrices with about ten numbers, in machine code.
 
-Calling LAPACK takes longer than these, and so does compiling the call.
+A call of LAPACK takes longer than these functions, and so does its compilation.
 
 References:
     Demmel and Veselić, "Jacobi's method is more accurate than QR", SIAM J. Matrix Analysis and
@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 _SWEEPS = 40
-"""Most sweeps of Jacobi's method, which converges quadratically: ten are many."""
+"""Largest number of sweeps of Jacobi's method, which converges quadratically in fewer than ten."""
 
 
 @njit(nogil=True, error_model="numpy")
@@ -46,7 +46,7 @@ def reflect(M, rows):
 
 @njit(nogil=True, error_model="numpy")
 def svd(M):
-    """U, s and V of M = U diag(s) Vᵀ, in any order; a column of U is 0 where s is, to rounding.
+    """U, s and V of M = U diag(s) Vᵀ, in any order; U has columns of 0 where s is about 0.
 
     Rotations of pairs of columns make all columns orthogonal.
 

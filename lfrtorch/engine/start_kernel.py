@@ -16,25 +16,25 @@ from lfrtorch.engine.small_matrices import reflect, svd
 from lfrtorch.maps.machine_code import call_slope, prepared
 
 ITERATIONS = 20
-"""Most Gauss-Newton steps of a search."""
+"""Largest number of Gauss-Newton steps of a search."""
 
 HALVINGS = 6
-"""Most trials in a Gauss-Newton step."""
+"""Largest number of trials in a Gauss-Newton step."""
 
 TOLERANCE = 1e-8
 """Relative decrease of the cost that ends a search."""
 
 SEEN = 1e-9
-"""Least effect on the weighted output of a direction of the initial state that is estimated."""
+"""Smallest effect on the weighted output for a direction of the initial state to be estimated."""
 
 FADED = 1e-12
-"""Part of an initial state that is invisible in the output: far below ``SEEN``."""
+"""Part of an initial state that cannot be seen in the output: far below ``SEEN``."""
 
 PASSES = 8
-"""Passes that estimate the prior's weight."""
+"""Number of passes that estimate the prior's weight."""
 
 _MET = 4.0 * np.finfo(np.float64).eps
-_BLOCK = 256  # samples whose rows are folded at once
+_BLOCK = 256  # number of samples whose rows are added at once
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -92,7 +92,7 @@ def fit_starts(
     first, jobs, step, sizes, weights, code, u, y, weight, white, spread, variance, counted, passes,
     x, z, w, y_hat,
 ):  # fmt: skip
-    """Search the initial states of the records of these jobs, from trajectories and over them.
+    """Search the initial states of these jobs' records; results overwrite the first trajectories.
 
     A step that does not lower the cost is quartered. The number of passes of the prior doubles from
     step to step up to ``PASSES``; 0 passes mean no prior.
@@ -118,7 +118,7 @@ def fit_starts(
                 L, squares, x0, white[r], spread[r], variance[r], counted[r], own, seen
             )
             before = cost = squares + v * _norm(_product_with(white[r], x0))
-            # A step that should hardly lower the cost is not worth a trial.
+            # A step with too small a predicted decrease of the cost is not tried.
             for _ in range(HALVINGS if promised > TOLERANCE * cost else 0):
                 _copy(best, trial)
                 for i in range(nx):
@@ -182,7 +182,7 @@ def _factor(sizes, weights, code, y, weight, at):
     return True, L
 
 
-# Loops for slices and expressions of arrays, which take numba seconds to compile.
+# Loops are used instead of slices and array expressions, which numba takes seconds to compile.
 
 
 @njit(nogil=True)

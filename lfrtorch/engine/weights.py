@@ -1,7 +1,7 @@
 """Vector of all numbers of a model, and the position of each matrix and weight in it.
 
-Simulations and derivatives are functions of these numbers. Compiled loops take the vector itself;
-torch takes matrices, which are views of it.
+Simulations and derivatives are functions of these numbers. Compiled loops use the vector itself;
+torch uses matrices, which are views of it.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ MATRICES = {
     "A": ("x", "x"), "Bu": ("x", "u"), "Bw": ("x", "w"), "Cz": ("z", "x"), "Dzu": ("z", "u"),
     "Cy": ("y", "x"), "Dyu": ("y", "u"), "Dyw": ("y", "w"),
 }  # fmt: skip
-"""Matrices in their order, each with the signal that it adds to and the one that it multiplies."""
+"""Matrices in their order, each with the signal it adds to and the signal it multiplies."""
 
 
 Held = Mapping[str, tuple[Tensor, Tensor]]
-"""Entries that a fit holds: masks and values by parameter, of its shape or broadcast to it."""
+"""Entries that a fit holds: masks and values by parameter, which broadcast to its shape."""
 
 
 class DirectTerms(NamedTuple):
@@ -67,7 +67,7 @@ class Layout:
         nx, nu, ny, nz, nw: sizes.
         static: the map.
         parameters: names, sizes and masks of free entries, in the order of the vector.
-        state_covariance: E x xᵀ over the training data, (nx, nx); before a fit 1.
+        state_covariance: E x xᵀ over the training data, (nx, nx); the identity before a fit.
     """
 
     def __init__(
@@ -84,11 +84,11 @@ class Layout:
         """Whether machine code simulates the model on its device."""
         self._parameters = parameters
         self.places, end = _places(sizes)
-        """Where each matrix stands, and its shape."""
+        """Position and shape of each matrix."""
         self.phi = slice(end, None)
         self._terms: dict[bytes, DirectTerms] = {}
 
-    # The rest is for derivatives alone; a simulation needs none of it.
+    # The following is for derivatives alone; a simulation does not need it.
 
     @cached_property
     def spans(self) -> dict[str, slice]:
@@ -164,7 +164,7 @@ class Weights:
 
     @property
     def state_covariance(self) -> Float[Tensor, "nx nx"]:
-        """Second moment E x xᵀ over the training data; before a fit 1."""
+        """Second moment E x xᵀ over the training data; the identity before a fit."""
         return self.layout.state_covariance
 
     @property

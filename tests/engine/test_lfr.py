@@ -191,7 +191,7 @@ def test_starts_that_it_does_not_have():
     lfr, u = small(), normal(1, 10, 2)
     with pytest.raises(ValueError, match="start is 'peridoic'"):
         lfr(u, None, "peridoic")
-    with pytest.raises(ValueError, match="start='estimated' needs a record's output"):
+    with pytest.raises(ValueError, match="start='estimated' needs measured outputs"):
         lfr(u, None, "estimated")
 
 
@@ -211,7 +211,7 @@ def test_one_record_needs_no_axis_of_records():
         (torch.zeros(200).double(), r"u has the shape \(200,\); give \(R, T, 2\)"),
         (torch.zeros(0, 5, 2).double(), "at least one record of one sample"),
         (torch.zeros(3, 0, 2).double(), "at least one record of one sample"),
-        (torch.zeros(3, 5, 2), r"give u\.to\(torch\.float64\), or move the model"),
+        (torch.zeros(3, 5, 2), "convert u or the model, so that both are alike"),
         (torch.zeros(3, 5, 2).bfloat16(), "u is torch.bfloat16"),
         (np.zeros((3, 5, 2)), "u is of type ndarray; give a torch tensor"),
     ],
@@ -276,7 +276,7 @@ def test_a_parametrised_weight_is_refused_and_a_map_of_torchs_layers_may_have_on
     lfr = small()
     assert lfr.cell.static is not None
     weight_norm(lfr.cell.static, "Wz")
-    with pytest.raises(InputError, match=r"static\.Wz is no parameter any more"):
+    with pytest.raises(InputError, match=r"static\.Wz is not a parameter any more"):
         lfr(torch.zeros(1, 5, 2, dtype=torch.float64))
     inner = weight_norm(torch.nn.Linear(2, 1, dtype=torch.float64))
     own = LFR(LFRCell(2, 2, 2, 2, 1, torch.nn.Sequential(inner), dtype=torch.float64))
