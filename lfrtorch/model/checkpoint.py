@@ -1,4 +1,4 @@
-"""The model of a checkpoint; who reads it says which static maps there may be."""
+"""Reads the model of a checkpoint; the caller defines which static maps it may have."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from lfrtorch.model.data_reach import Cloud, DataReach
 from lfrtorch.model.model import Model
 
 MapMaker = Callable[[Any, int, int, torch.dtype], Module | None]
-"""Makes a static map of its description, nz, nw and its type; None is no map."""
+"""Makes a static map from its description, nz, nw and dtype; None if there is no map."""
 
 
 def read_model(
     folder: str | Path, maker_of: Callable[[Any], MapMaker], inside: Sequence[str]
 ) -> tuple[Model, dict[str, Any] | None, dict[str, Tensor]]:
-    """The model in a checkpoint, and what ``write_model`` was given of it besides.
+    """The model in a checkpoint, and the ``about`` and ``known`` that ``write_model`` was given.
 
-    ``maker_of`` the description of a static map says what makes one.
+    ``maker_of`` returns the maker of a static map from the map's description.
     """
     description, weights = checkpoint.read(folder, inside)
     own, _ = innermost(description)
@@ -73,7 +73,7 @@ def _made(description: dict[str, Any], weights: dict[str, Tensor], maker: MapMak
     z, y = (description.get(name, True) for name in ("z_feedthrough", "feedthrough"))
     for given in (
         {name: (mask != 0, cell.get_parameter(name).detach()) for name, mask in masks.items()},
-        held.structure(cell, named),  # of checkpoints of before, as what follows
+        held.structure(cell, named),  # old checkpoints have no masks, but these settings
         held.no_feedthrough(cell, z=z, y=y),
         held.integrators(cell) if cell.nw else {},
     ):
@@ -84,6 +84,6 @@ def _made(description: dict[str, Any], weights: dict[str, Tensor], maker: MapMak
 
 
 def _under(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Take the tensors whose names begin so, without that beginning."""
+    """Take out the tensors whose names begin with a prefix, and remove the prefix."""
     names = [name for name in weights if name.startswith(prefix)]
     return {name.removeprefix(prefix): weights.pop(name) for name in names}

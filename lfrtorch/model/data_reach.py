@@ -26,7 +26,7 @@ class Cloud:
         middle: mean.
         axes: axes (z - middle) has unit covariance.
         ends: least and largest entries of that vector: a box of all samples.
-        farthest: length of that vector that 99 % of the samples do not exceed.
+        farthest: length of that vector for 99 % of the samples, at most.
 
     Shape:
         middle: (n,), axes: (n, n), ends: (n, 2).
@@ -48,7 +48,7 @@ class Cloud:
         )
 
     def surprise(self, z: Float[Array, "*T n"]) -> Float[Array, "*T"]:
-        """Surprise index of z: its distance from the middle; 1 contains 99 % of the samples."""
+        """Surprise index of z: its distance from the middle; at most 1 for 99 % of the samples."""
         distance = np.linalg.norm((z - self.middle) @ self.axes.T, axis=-1)
         return np.asarray(distance / self.farthest)
 

@@ -76,13 +76,13 @@ class NoiseCovariance:
             Gy = np.linalg.cholesky(R)
         except np.linalg.LinAlgError:
             raise InputError(
-                "R is not positive definite; every output needs noise of its own, if only a little."
+                "R is not positive definite; give every output some noise of its own."
             ) from None
         across = np.linalg.solve(Gy, S.T).T
         own = _root(Q - across @ across.T, np.abs(Q).max())
         if own is None:
             raise InputError(
-                "Q - S R⁻¹ Sᵀ has a negative eigenvalue; S is no covariance with this Q and R."
+                "Q - S R⁻¹ Sᵀ has a negative eigenvalue; this S is not possible with Q and R."
             )
         return np.block([[Gy, np.zeros((ny, nx))], [across, own]])
 
@@ -93,7 +93,7 @@ class ExtendedKalmanFilter(StateObserver):
 
     ``update`` corrects the states by the output, with ∂y/∂x at the predicted states, and propagates
     them to the next sample, with ∂x+/∂x at the corrected states. Covariances are kept as square
-    roots, and none is a difference of two. A missing output corrects nothing: the covariance grows.
+    roots, and never subtracted. A missing output corrects nothing, so the covariance grows.
 
     Args:
         cell, scaler, inputs, outputs: parts of the model.
@@ -232,7 +232,7 @@ def inside_limits(record: Record) -> Float[Array, "T ny"]:
 
 
 def _covariance(name: str, given: ArrayLike, size: int) -> Float[Array, "n n"]:
-    """Return a covariance from itself, its variances, or one variance."""
+    """Return a covariance matrix from a matrix, variances, or one variance."""
     value = reals(name, given)
     if value.ndim < 2 and value.size in (1, size):
         value = np.diag(np.broadcast_to(value, size))
@@ -249,7 +249,7 @@ def _covariance(name: str, given: ArrayLike, size: int) -> Float[Array, "n n"]:
 def with_variances(
     name: str, given: ArrayLike, more: Float[Array, " m"], size: int
 ) -> Float[Array, "n n"]:
-    """Return a covariance of some states and of further ones independent of them."""
+    """Return a covariance of some states and of further states that are independent of them."""
     return scipy.linalg.block_diag(_covariance(name, given, size), np.diag(more))
 
 

@@ -49,8 +49,8 @@ class Parameter:
         _finite("value", self.value)
         if not self.low <= self.value <= self.high or self.low == self.high:
             raise InputError(
-                f"a parameter's value is {self.value}, its bounds {self.low} and {self.high}; give "
-                "low <= value <= high, and a parameter that is known as a number in the equations."
+                f"a parameter has value {self.value} and bounds {self.low}, {self.high}; give low "
+                "<= value <= high with low < high, or write a known value into the equations."
             )
         if self.scale is not None:
             number("scale", self.scale, positive=True)
@@ -71,7 +71,7 @@ class State:
         name: name in the equations.
         unit: unit, as "rad/s".
         rest: value at rest, and at the beginning of a record with ``start="zero"``.
-        scale: approximate rms about that. Default: rms in a simulation of the training records.
+        scale: approximate rms about ``rest``. Default: rms in a simulation of the training records.
 
     Example:
         >>> lfrtorch.State("speed", unit="m/s")
@@ -112,12 +112,12 @@ class Known:
         sees: inputs of a learned part beside the model: states by name, and ``"u"`` for the
             inputs. Default: all.
         acts_on: states by name, and ``"y"`` for the outputs, that the learned part acts on.
-            Default: all. The rate of a position is certainly the speed, so that an unknown effect
-            acts on the speed alone.
+            Default: all. For example, the rate of a position is exactly the speed, so an unknown
+            effect acts on the speed alone.
 
     Raises:
-        ValueError: names that are no Python names, stand twice or belong to nothing; with the
-            data, functions that are not composed of scalars and torch's elementary functions.
+        ValueError: names that are not Python names, that are repeated or that are unknown; once
+            the data are known, functions other than of scalars and torch's elementary functions.
 
     Example:
         >>> def pendulum(x, u, p):
@@ -159,7 +159,7 @@ class Known:
         self.centred = intersample == "bl"
         if self.centred and method == "discrete":
             raise InputError(
-                "intersample is 'bl', and a discrete model has nothing between samples."
+                "intersample is 'bl', but a discrete model has nothing between samples."
             )
         if not self.states:
             raise InputError("states is empty; name at least one.")
@@ -167,7 +167,7 @@ class Known:
             self._x = namedtuple("x", [state.name for state in self.states])
             self._p = namedtuple("p", self.parameters)
         except (ValueError, TypeError) as error:
-            raise InputError(f"a name of a state or parameter cannot be one: {error}.") from None
+            raise InputError(f"a state or a parameter has an invalid name: {error}.") from None
         self.sees, self.acts_on = (
             self._among("sees", sees, "u"),
             self._among("acts_on", acts_on, "y"),
@@ -198,7 +198,7 @@ class Known:
         if others and len(others) != len(left):
             raise InputError(
                 f"the known model has {len(names)} state(s), {', '.join(names)}, and the data have "
-                f"{len(outputs)} output(s), {', '.join(outputs)};\ncall outputs as the states that "
+                f"{len(outputs)} output(s), {', '.join(outputs)};\nname outputs by the states that "
                 "they are, or give outputs=, a function of (x, u, p) that returns a value for each "
                 f"output, for instance lambda x, u, p: (x.{names[0]},)."
             )

@@ -68,13 +68,13 @@ Disturbance = Literal["input", "output"] | ArrayLike
 """Place of constant disturbances: all inputs, all outputs, or a matrix of their effects."""
 
 _STEPS = 100
-"""Random steps of the input on which a resampled model is compared."""
+"""Number of random steps of the input on which a resampled model is compared."""
 
 _HELD = 20
-"""Common samples of each of these steps."""
+"""Number of common samples for which each of these steps is held."""
 
 _COMMON = 100
-"""Longest common sample of two rates, in samples."""
+"""Largest length of the common sample of two rates, in samples of either."""
 
 _TOGETHER = 1000
 """Number of predictions that are simulated at once."""
@@ -96,7 +96,7 @@ class Resampled(NamedTuple):
     """A model at another sampling rate.
 
     Args:
-        model: at that rate.
+        model: the model at that rate.
         error: rms of the difference from the output of the original, (ny,), physical units, at
             common samples of an input of random steps within the range of the data.
 
@@ -116,7 +116,7 @@ class Model:
 
     Args:
         lfr: the model in normalised units.
-        scaler: physical to normalised units, at both ends.
+        scaler: conversion of inputs and outputs between physical and normalised units.
         fs: sampling frequency in Hz.
         inputs, outputs: channel names and units.
         fitted_to: description of the data, for ``print(model)``.
@@ -129,12 +129,12 @@ class Model:
         K: (nx, ny).
 
     Raises:
-        ValueError: weights, scales, channels or a gain of other sizes, a scale that is not
-            positive, or a rate that is none.
+        ValueError: weights, scales, channels or a gain of wrong sizes, a scale that is not
+            positive, or an invalid sampling rate.
 
     ``print(model)`` shows sizes, channels, poles and gains: of the linear part A, Bu, Cy, Dyu, and
-    of the model linearised at rest at the inputs' offsets. ``lfrtorch.analysis`` has its figure,
-    its residuals on records, and its linearisation about any point.
+    of the model linearised at rest at the inputs' offsets. ``lfrtorch.analysis`` plots the model,
+    tests its residuals on records, and linearises it about any point.
 
     Example:
         >>> model.sizes, model.parameter_count
@@ -225,10 +225,11 @@ class Model:
 
     @property
     def state_covariance(self) -> Float[Array, "nx nx"]:
-        """Second moment E x xᵀ of the states over the training data, about 0; before a fit 1.
+        """Second moment E x xᵀ of the states over the training data, about 0.
 
-        This is the covariance of the error of x = 0 amid such data. The states are those of the
-        simulation, or of the prediction for a model with K. Its diagonal is 1 after a fit.
+        If such data begin at an unknown state, it is the covariance of the error of x = 0. The
+        states are those of the simulation or, for a model with K, of the prediction. The diagonal
+        is 1 after a fit; before a fit the matrix is the identity.
 
         Example:
             >>> model.state_covariance
@@ -237,7 +238,7 @@ class Model:
         return self.lfr.cell.state_covariance.double().cpu().numpy()
 
     def reaching(self, records: Record | Sequence[Record]) -> Model:
-        """The model with the reach of these data: the ranges of u and y, and z of the simulation.
+        """The model with the reach of these data: the ranges of u, y and the simulated z.
 
         Models from ``lfrtorch.identify`` have the reach of their estimation data. Exports and
         ``lfrtorch.analysis.linearise`` use it to tell where the model extrapolates.
@@ -273,20 +274,20 @@ class Model:
 
     @property
     def parameter_count(self) -> int:
-        """Number of parameters P; entries that a fit holds are none."""
+        """Number of parameters P, without held entries."""
         cell = self.lfr.cell
         held = sum(int(mask.sum()) for mask in cell.held.values())
         return sum(p.numel() for p in cell.parameters()) - held
 
     @property
     def net_parameter_count(self) -> int:
-        """P less the gauge directions, which change the parameters and not the output.
+        """P minus the number of gauge directions, which change parameters but not the output.
 
         The gauge directions are nx² for the coordinates of x, nz² and nw² for those of z and w (a
         network and a polynomial absorb them), max(0, nw - ny) for a constant w that shifts the
         origin of the state, and nz nw for the linear terms of a polynomial, which A, Bu, Cy and Dyu
-        contain as well. Held entries leave fewer. If only n < nz signals enter z (the inputs, or
-        the states without feedthrough), the map counts as one of n inputs.
+        contain as well. Held entries leave fewer directions. If only n < nz signals enter z (the
+        inputs, or the states without feedthrough), the map counts as a map with n inputs.
         """
         cell = self.lfr.cell
         shapes = {"Cz": (cell.nz, cell.nx), "Dzu": (cell.nz, cell.nu)}
@@ -311,8 +312,8 @@ class Model:
         """Simulated output in physical units.
 
         Args:
-            data: a record, an input in physical units, or a pandas data frame with columns named as
-                the inputs; its outputs come as a frame with the same index.
+            data: a record, an input in physical units, or a pandas data frame with a column for
+                each input name; for a frame, the result is a frame with the same index.
             start: ``"zero"`` (x = 0: at rest at the input's offset, up to the network's bias),
                 ``"given"`` (x0), ``"periodic"``, ``"measured"``: from the state determined by the
                 record's first output, or ``"estimated"``: from the most probable state, given the
@@ -376,7 +377,7 @@ class Model:
             state = torch.tensor(given).to(like).reshape(1, -1)
         if start in ("estimated", "measured"):
             if not isinstance(data, Record):
-                raise InputError(f"start='{start}' needs a record: its y tells the state.")
+                raise InputError(f"start='{start}' needs a record, whose y determines the state.")
             trajectory = simulate_record(self.lfr, self.scaler.normalise(data), start)
         else:
             trajectory = self.lfr.trajectory(v, state, start)
@@ -387,7 +388,7 @@ class Model:
         """Output (T, ny) predicted ``horizon`` samples ahead, in physical units.
 
         The prediction of a sample uses the inputs up to it, and the outputs up to ``horizon``
-        samples before it. The first samples, which have no such outputs, are simulated. A model
+        samples before it. The first ``horizon`` samples are simulated instead. A model
         without K predicts from the single output ``horizon`` samples before, which must determine
         its states: the start of its records is ``"measured"``.
 
@@ -418,7 +419,7 @@ class Model:
         u = torch.as_tensor(self.scaler.normalise_u(record.u)).to(cell.A)
         x, y = states.to(cell.A), cell.A.new_empty(T, cell.ny)
         with torch.no_grad():
-            for ahead in range(min(horizon, T)):  # x: predicted so far from the known outputs
+            for ahead in range(min(horizon, T)):  # x has the states predicted so far
                 y[ahead:], after = cell(u[ahead:], x)
                 x = after[:-1]
         return record.shown(self.scaler.restore_y(y.double().cpu().numpy()))
@@ -482,21 +483,21 @@ class Model:
         x0: ArrayLike | None = None,
         P0: ArrayLike | None = None,
     ) -> StateObserver:
-        """Observer of the states of the running system, sample by sample.
+        """Observer that estimates the states of a running system, sample by sample.
 
-        Given the covariances of the noise it is an extended Kalman filter, of any model. Otherwise
-        it has the constant gain K of a model in innovation form.
+        If ``noise`` is given, it is an extended Kalman filter, for any model. Otherwise it uses the
+        constant gain K, which a model in innovation form has.
 
         Args:
             noise: covariances of the noise on states and outputs. Default: the gain K.
             disturbance: also estimate unmeasured constant disturbances, such as a load, on the
-                ``"input"``, the ``"output"``, or by a matrix, see ``with_disturbance``. A
-                controller without offset needs it. Default: none.
-            after: measurements until now; the states continue from its end. A filter begins at its
-                first sample from x = 0 and P0.
+                ``"input"``, the ``"output"``, or by a matrix, see ``with_disturbance``. Offset-free
+                control needs such estimates. Default: none.
+            after: measurements until now; the states continue from the end of this record. A
+                filter begins at its first sample, with x = 0 and P0.
             x0: initial states without ``after``, in the model's coordinates. Default: 0.
-            P0: covariance of the error of a filter's initial states, variances, or one. Default:
-                ``state_covariance``, the right one amid data like those of the fit.
+            P0: covariance of the error of a filter's initial states, their variances, or one
+                variance. Default: ``state_covariance``, which suits data like those of the fit.
 
         Raises:
             ValueError: neither K nor noise, invalid covariances, both a record and a state, a
@@ -512,7 +513,7 @@ class Model:
         """
         if after is not None:
             if x0 is not None:
-                raise InputError("after and x0 both say where the states begin; give one of them.")
+                raise InputError("after and x0 both set the initial states; give only one of them.")
             self.check(after)
         known = self.lfr.cell, self.scaler, self.inputs, self.outputs
         begin = np.zeros(self.lfr.cell.nx) if x0 is None else x0
@@ -533,8 +534,8 @@ class Model:
             return found
         if disturbance is not None:
             raise InputError(
-                "a disturbance is estimated by a Kalman filter: give noise, too, for example that "
-                "of lfrtorch.estimate_noise(model, record)."
+                "a disturbance is estimated by a Kalman filter: give noise, too, for example "
+                "noise=lfrtorch.estimate_noise(model, record)."
             )
         if self.K is None:
             raise InputError(NO_OBSERVER)
@@ -548,16 +549,16 @@ class Model:
     ) -> tuple[Model, NoiseCovariance]:
         """Model with constant disturbances as states, and the noise of all its states.
 
-        The states are x and then d, in physical units: u + Eu d replaces u, and Ey d is added to y.
-        The model may be exported with its observer. A controller that predicts with it, from
-        estimates of both, has no offset.
+        The states are x, then d in physical units: u + Eu d replaces u, and Ey d is added to y. The
+        model may be exported with its observer. A controller that predicts with this model, from
+        estimates of x and d, has no offset.
 
         Args:
-            at: ``"input"``, one on each input; ``"output"``, one on each output; or the matrix
-                [Eu; Ey] with a row for each input, then each output, and a column for each
-                disturbance.
-            noise: covariances of the model's noise. A disturbance drifts by a tenth of the scale of
-                its channel, rms, in the slowest time constant, unless Q is of all states.
+            at: ``"input"``, a disturbance on each input; ``"output"``, a disturbance on each
+                output; or the matrix [Eu; Ey] with a row for each input, then each output, and a
+                column for each disturbance.
+            noise: covariances of the model's noise. Unless Q includes the disturbances, they drift
+                in the slowest time constant by a tenth of their channel's scale, rms.
 
         Shape:
             at: (nu + ny, nd).
@@ -592,8 +593,8 @@ class Model:
         local = linearised_at(whole, cell.A.new_zeros(nu), x)
         if not tells_apart(local, nx):
             raise InputError(
-                f"the {ny} output(s) at rest do not tell {nd} disturbance(s) from each other and "
-                "from the states; give fewer: a matrix of those that act."
+                f"the {ny} output(s) at rest do not distinguish {nd} disturbance(s) and the "
+                "states; give a matrix with fewer disturbances."
             )
         if np.shape(noise.Q) != (nx + nd, nx + nd):
             moduli = np.abs(np.linalg.eigvals(local.A[:nx, :nx]))
@@ -606,15 +607,15 @@ class Model:
         """The model at another sampling rate, with inputs that are held over a sample.
 
         The model linearised at rest is resampled exactly, by the logarithm of its matrices. The
-        static map is evaluated at the new samples, so that the model differs away from rest;
-        ``error`` is the size of the difference. The gain K of a noise model is dropped.
+        static map is evaluated at the new samples, so the models differ away from rest; ``error``
+        is the rms of the difference. The gain K of a noise model is dropped.
 
         Args:
-            fs: Hz.
+            fs: new sampling rate in Hz.
 
         Raises:
-            ValueError: no rate, or a pole at 0 or on the negative real axis, which no continuous
-                system has.
+            ValueError: an invalid rate, or a pole at 0 or on the negative real axis, which no
+                continuous system has.
 
         References:
             Franklin, Powell and Workman, "Digital Control of Dynamic Systems", 1998, chapter 4.
@@ -666,7 +667,7 @@ class Model:
         return E
 
     def to_model(self) -> Model:
-        """Return the model itself, as a linear model returns its own.
+        """Return the model itself, for code that also takes linear models.
 
         Example:
             >>> model.to_model() is model
@@ -700,7 +701,7 @@ class Model:
         return replace(self, lfr=LFR(cell), scaler=scaler, inputs=inputs, K=None)
 
     def innovation_form(self) -> Model:
-        """Model of the system, with K, from its predictor: the inverse of ``predictor``.
+        """Model of the system, with K, from its predictor; the inverse of ``predictor``.
 
         Example:
             >>> linear = lfrtorch.estimate_bla(record, nx=1, refine="prediction")
@@ -731,13 +732,13 @@ class Model:
             if signal.shape[1] != len(channels):
                 names = ", ".join(channel.name for channel in channels)
                 raise InputError(
-                    f"record '{record.name}' has {signal.shape[1]} {side}(s) and the model "
+                    f"record '{record.name}' has {signal.shape[1]} {side}(s), but the model has "
                     f"{len(channels)} ({names}); give a column for each."
                 )
         if record.x0 is not None and len(record.x0) != self.lfr.cell.nx:
             raise InputError(
-                f"record '{record.name}' has a start state x0 of {len(record.x0)} entries and the "
-                f"model {self.lfr.cell.nx} states; give one for each."
+                f"record '{record.name}' has a start state x0 of {len(record.x0)} entries, but the "
+                f"model has {self.lfr.cell.nx} states; give an entry for each."
             )
         if not np.isclose(record.fs, self.fs):
             raise InputError(
@@ -761,23 +762,23 @@ class Model:
 def simulate_blocks(
     model: Model, blocks: Iterable[ArrayLike], *, x0: ArrayLike | None = None
 ) -> Iterator[Array]:
-    """Simulated output of an input in blocks, the same as in one go.
+    """Simulate an input block by block, with the same output as in one simulation.
 
-    The numbers are the same to the bit if the CPU has the model compiled (linear, a ``Network`` or
-    a ``Polynomial``), otherwise to rounding. Only one block is in memory.
+    The output is bit-identical if the model runs compiled on the CPU (linear, ``Network`` or
+    ``Polynomial``), otherwise equal up to rounding. Only one block is in memory at a time.
 
     Args:
         model: the model to simulate; for a linear one, ``LinearModel.to_model`` gives it.
-        blocks: the input, physical units, one block after another, of any lengths.
-        x0: initial state in the model's coordinates. Default: 0. The state of a measurement is
-            ``model.signals(record, start="estimated").x[0, 0]``.
+        blocks: the input in physical units, as blocks of any lengths.
+        x0: initial state in the model's coordinates. Default: 0. The initial state of a measured
+            record is ``model.signals(record, start="estimated").x[0, 0]``.
 
     Shape:
         blocks: (n, nu) or (n,), x0: (nx,) -> (n, ny) for each block, physical units.
 
     Raises:
-        ValueError: in the block where it is found: an input of the wrong shape or with NaN, or a
-            model that diverges; the message says at which sample of the whole input.
+        ValueError: when a block has the wrong shape or NaN, or the model diverges in it; the
+            message gives the sample of the whole input.
 
     Example:
         >>> blocks = [record.u[:150], record.u[150:]]
@@ -821,7 +822,7 @@ def write_model(
     about: Mapping[str, Any] | None = None,
     known: Mapping[str, Tensor] | None = None,
 ) -> Path:
-    """Write the checkpoint of a model, with ``about`` and ``known`` of a linear one."""
+    """Write the checkpoint of a model; ``about`` and ``known`` are further data of a linear one."""
     cell, s = model.lfr.cell, model.scaler
     description = {
         "sizes": {"nu": cell.nu, "ny": cell.ny, "nx": cell.nx, "nz": cell.nz, "nw": cell.nw},
@@ -854,7 +855,7 @@ def _inputs(record: Record) -> Array:
 
 
 def check_channels(model: Model, record: Record) -> None:
-    """Refuse data of other channels than the model's with a ValueError; a unit may be unknown."""
+    """Raise a ValueError if channels are not those of the model; unknown units are accepted."""
     for side, channels, found in (
         ("inputs", model.inputs, record.inputs),
         ("outputs", model.outputs, record.outputs),
@@ -865,6 +866,6 @@ def check_channels(model: Model, record: Record) -> None:
         ]
         if len(channels) != len(found) or not all(alike):
             raise InputError(
-                f"the model has the {side} {', '.join(map(str, channels))} and the data "
+                f"the model has the {side} {', '.join(map(str, channels))}, but the data have "
                 f"{', '.join(map(str, found))}; give data of the same channels."
             )

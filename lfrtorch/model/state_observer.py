@@ -1,4 +1,4 @@
-"""Online observers: a model follows a running system, sample by sample."""
+"""Online observers, which estimate the states of a running system, sample by sample."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from lfrtorch.engine.simulation_kernel import simulate_records
 
 
 class StateObserver(ABC):
-    """Observer of the states of a running system: ``predict`` the output, then ``update`` by it.
+    """Observer of the states of a running system: call ``predict``, measure, then call ``update``.
 
     A controller that measures y before it chooses u calls ``correct(y)``, which updates the states
-    by that output, and then ``advance(u)``; ``update`` does both with the input of ``predict``.
+    by this output, and then ``advance(u)``. ``update`` does both with the input of ``predict``.
 
-    It works in float64, in machine code for the static maps of the package. ``Model.observer``
-    makes one with the constant gain K, or an extended Kalman filter.
+    An observer computes in float64, and in machine code for the static maps of the package.
+    ``Model.observer`` makes an observer with a constant gain K, or an extended Kalman filter.
 
     Args:
         cell, scaler, inputs, outputs: parts of the model.
         x0: initial states, in the model's coordinates.
-        disturbances: number of the last states that are disturbances, in physical units.
+        disturbances: number of disturbances in physical units, which are the last states.
 
     Shape:
         x0: (nx,).
@@ -65,7 +65,7 @@ class StateObserver(ABC):
         self._predicted, self._corrected = False, False
         fed_back = bool(cell.Dyw.any()) and bool(cell.Dzu.any())
         self._feedthrough = bool(cell.Dyu.any()) or fed_back
-        # Views of those arrays: making a view takes longer than a product of small matrices.
+        # Views are made once, as making a view takes longer than a product of small matrices.
         self._u_now, self._y_hat = self._u[0, 0], self._y[0, 0]
         self._y_now, self._e, self._zero = np.zeros((3, cell.ny))
         at = scaler.u_offset, scaler.u_scale, scaler.y_offset, scaler.y_scale
@@ -79,13 +79,13 @@ class StateObserver(ABC):
 
     @property
     def state(self) -> Float[Array, " nx"]:
-        """States in the model's coordinates; they may be set, as after a change of the plant.
+        """States in the model's coordinates; they may be set, for example when the plant changes.
 
-        They are predicted for the next sample; after ``correct`` they are the estimates given the
-        output of this sample.
+        They are predictions for the next sample. After ``correct`` they are estimates that include
+        the output of this sample.
 
         Raises:
-            ValueError: another number of states, or some that are not finite.
+            ValueError: a wrong number of states, or states that are not finite.
         """
         return self._x_now[: self._own].copy()
 
@@ -98,7 +98,7 @@ class StateObserver(ABC):
         """Disturbances in physical units; they may be set. None without a disturbance model.
 
         Raises:
-            ValueError: another number of disturbances, or some that are not finite.
+            ValueError: a wrong number of disturbances, or disturbances that are not finite.
         """
         return self._x_now[self._own :].copy()
 
@@ -109,14 +109,14 @@ class StateObserver(ABC):
     def predict(self, u: ArrayLike) -> Float[Array, " ny"]:
         """Output at this sample, from its input and all samples before it; physical units.
 
-        It may be called several times, for several inputs; the last one counts.
+        It may be called several times, for several inputs; only the last call counts.
 
         Args:
-            u: the input now, (nu,) or a number.
+            u: the present input, (nu,) or a number.
 
         Raises:
-            ValueError: another number of inputs, one that is not finite, or this sample was
-                corrected before.
+            ValueError: a wrong number of inputs, an input that is not finite, or a call after this
+                sample was corrected.
         """
         if self._corrected:
             raise InputError("this sample was corrected: call advance(u) before predict.")
@@ -126,14 +126,14 @@ class StateObserver(ABC):
         return _restored(self._y_hat, self._y_offset, self._y_scale)
 
     def update(self, y: ArrayLike | None) -> Float[Array, " ny"]:
-        """Go on to the next sample; returns the error of the prediction, y - y_hat.
+        """Update the states by y, go on to the next sample, and return the error y - y_hat.
 
         Args:
             y: measured output, (ny,) or a number, with NaN for a missing one; None if all are
                 missing. The error of a missing output is NaN, and changes no state.
 
         Raises:
-            ValueError: another number of outputs, an infinite one, or nothing was predicted.
+            ValueError: a wrong number of outputs, an infinite output, or no call of ``predict``.
         """
         if not self._predicted:
             raise InputError("nothing was predicted at this sample: call predict(u) before.")
@@ -143,18 +143,18 @@ class StateObserver(ABC):
         return e
 
     def correct(self, y: ArrayLike | None, u: ArrayLike | None = None) -> Float[Array, " ny"]:
-        """Correct the states by the output of this sample; returns y - y_hat.
+        """Correct the states by the output of this sample, and return y - y_hat.
 
-        ``advance`` then goes on to the next sample. A constant gain K leaves the states unchanged:
-        the innovation enters the next ones.
+        ``advance`` then goes on to the next sample. If the gain K is constant, the present states
+        do not change: the innovation only changes the next states.
 
         Args:
             y: as in ``update``.
             u: the input at this sample, which only a model with feedthrough needs.
 
         Raises:
-            ValueError: as ``update``; no u for a model with feedthrough; this sample was corrected
-                before.
+            ValueError: as in ``update``; no u for a model with feedthrough; or this sample was
+                already corrected.
 
         Example:
             >>> observer = model.observer(noise=lfrtorch.NoiseCovariance(Q=1e-4, R=1e-2))
@@ -176,10 +176,10 @@ class StateObserver(ABC):
     def advance(self, u: ArrayLike) -> None:
         """Go on to the next sample with the input of this one, (nu,) or a number.
 
-        A sample that was not corrected has no outputs.
+        If the sample was not corrected, all its outputs count as missing.
 
         Raises:
-            ValueError: another number of inputs, or one that is not finite.
+            ValueError: a wrong number of inputs, or an input that is not finite.
         """
         self._take(u)
         if not self._corrected:
@@ -202,9 +202,9 @@ class StateObserver(ABC):
             raise InputError(f"u is {given}; give finite numbers.")
 
     def _step(self) -> None:
-        """Write the output and the next states without noise."""
+        """Compute the output and the next states without noise."""
         if self._call is not None:
-            self._x_next.fill(np.nan)  # no other trajectory that could be met
+            self._x_next.fill(np.nan)  # so that the simulation does not stop at old states
             simulate_records(*self._call)
         else:
             with torch.no_grad():
@@ -225,7 +225,7 @@ class StateObserver(ABC):
 
     @abstractmethod
     def _go_on(self) -> None:
-        """Replace the states by the next ones."""
+        """Replace the states by those of the next sample."""
 
 
 @final
@@ -279,7 +279,7 @@ def _sample(values: ArrayLike, channels: tuple[Channel, ...], name: str) -> Arra
     return found
 
 
-# A call of NumPy costs as much time as a small model's step.
+# A call of NumPy takes as long as a step of a small model.
 @njit(cache=True, nogil=True, error_model="numpy")
 def _normalise(given, offset, scale, out):
     """Write (given - offset) / scale into out; return True if all given values are finite."""
@@ -292,7 +292,7 @@ def _normalise(given, offset, scale, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _innovation(given, offset, scale, predicted, out, e):
-    """Write the same, and e = out - predicted; return True if none is infinite: NaN is missing."""
+    """Write the same and e = out - predicted; return False if a value is infinite."""
     _normalise(given, offset, scale, out)
     known = True
     for i in range(len(out)):
@@ -303,7 +303,7 @@ def _innovation(given, offset, scale, predicted, out, e):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _restored(normalised, offset, scale):
-    """Physical values of normalised ones."""
+    """Physical values from normalised values."""
     found = np.empty(len(scale))
     for i in range(len(scale)):
         found[i] = offset[i] + scale[i] * normalised[i]

@@ -183,8 +183,8 @@ def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypa
         (["checkpoint=RUN", DATA, "out=RUN/there.json"], "there.json' exists; give another name"),
         (["checkpoint=RUN/..", DATA], "is not a checkpoint; give one of those in it: RUN/../run."),
         (["checkpoint=RUN", DATA[:-1] + ", fs: 25}"], "sampled at 25 Hz and the model at 50.0 Hz"),
-        (["checkpoint=RUN", DATA[:-1] + ", name: v}"], "has the inputs u1 (N) and the data v (N);"),
-        (["checkpoint=RUN", DATA[:-1] + ", unit: kN}"], "inputs u1 (N) and the data u1 (kN);"),
+        (["checkpoint=RUN", DATA[:-1] + ", name: v}"], "inputs u1 (N), but the data have v (N);"),
+        (["checkpoint=RUN", DATA[:-1] + ", unit: kN}"], "(N), but the data have u1 (kN);"),
         (["checkpoint=RUN", "+bench=nonsense"], "nonsense"),
     ],
 )

@@ -104,7 +104,7 @@ def test_it_is_fitted_again_and_in_windows():
     ("given", "message"),
     [
         ({"D": [[1.0]]}, "fixed names 'D'; the matrices are A, Bu"),
-        ({"Cy": [1.0, 0.0]}, r"fixed Cy has the shape \(2,\); the model's has \(1, 2\)"),
+        ({"Cy": [1.0, 0.0]}, r"fixed Cy has the shape \(2,\); give \(1, 2\), the model's"),
         ({"Cy": [[NAN, NAN]]}, "give some finite numbers"),
         ({"Cy": [[np.inf, 0.0]]}, "give some finite numbers"),
     ],
@@ -119,8 +119,8 @@ def test_what_is_no_matrix_is_refused(given: dict[str, Any], message: str):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"nz": 2, "fixed": {"Dzu": [[1.0]]}}, r"the model's has \(2, 1\)"),
-        ({"fixed": {"Cy": [[1.0, 0.0, 0.0]]}}, r"the model's has \(1, 2\)"),
+        ({"nz": 2, "fixed": {"Dzu": [[1.0]]}}, r"give \(2, 1\), the model's"),
+        ({"fixed": {"Cy": [[1.0, 0.0, 0.0]]}}, r"give \(1, 2\), the model's"),
     ],
 )
 def test_settings_are_refused_before_any_fit(

@@ -216,11 +216,11 @@ def test_starts_vary_within_the_bounds():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Parameter(1.0, low=2.0), "value is 1.0, its bounds 2.0 and inf"),
+        (lambda: Parameter(1.0, low=2.0), "value 1.0 and bounds 2.0, inf"),
         (lambda: Parameter(float("nan")), "value is nan; give a finite number"),
         (lambda: State("a", scale=-1.0), "scale"),
         (lambda: known(states=[]), "states is empty"),
-        (lambda: known(states=["a b"]), "a name of a state or parameter cannot be one"),
+        (lambda: known(states=["a b"]), "a state or a parameter has an invalid name"),
         (lambda: known(method="bdf"), "method"),
         (lambda: known(method="discrete", substeps=2), "substeps=1 with 'discrete'"),
         (lambda: known(method="discrete", intersample="bl"), "nothing between samples"),
@@ -233,7 +233,7 @@ def test_starts_vary_within_the_bounds():
         ),
         (
             lambda: Known(lambda x, u, p: (u * x.a,), states=["a"]).equations(1, ["y"]),
-            r"it uses \(<a number>,\), which is no single number",
+            r"it uses \(<a number>,\), which is not a single number",
         ),
         (
             lambda: Known(lambda x, u, p: torch.cat([x.a, x.a]), states=["a"]).equations(1, ["y"]),

@@ -165,7 +165,7 @@ def test_an_observer_finds_a_constant_disturbance(at: str):
 def test_disturbances_that_the_outputs_do_not_tell_are_refused():
     model = MODELS["softplus"]
     noise, count = some_noise(model), len(model.inputs) + len(model.outputs)
-    with pytest.raises(ValueError, match="do not tell"):
+    with pytest.raises(ValueError, match="do not distinguish"):
         model.observer(noise=noise, disturbance=np.eye(count))
     with pytest.raises(ValueError, match="disturbance is 'load'"):
         model.with_disturbance("load", noise)

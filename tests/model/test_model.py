@@ -210,7 +210,7 @@ def refused(model: Model, message: str, *data, **options):
 def test_number_of_inputs(model: Model):
     refused(model, "input has 1 column(s) and 2 channel(s) are expected (u1, u2)", np.ones(9))
     record = Record(np.ones((9, 3)), np.ones(9), model.fs, name="lab")
-    refused(model, "record 'lab' has 3 input(s) and the model 2 (u1, u2); give a column", record)
+    refused(model, "record 'lab' has 3 input(s), but the model has 2 (u1, u2); give a col", record)
     refused(model, "shape ()", 3.0)
 
 
