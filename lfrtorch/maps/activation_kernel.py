@@ -10,12 +10,12 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 TANH, SIGMOID, RELU, RBF, SOFTPLUS = range(5)
-"""Numbers of the activations in compiled code; their rows are in ``activations``."""
+"""Numbers of the activations in compiled code; ``activations`` has a row for each."""
 
 
 @njit(nogil=True, fastmath={"contract", "reassoc"})
 def dot(x, a, y, b, count):
-    """Inner product of x from a on and y from b on; sums in any order are vector instructions."""
+    """Inner product of x from a on and y from b on, summed in any order by vector instructions."""
     total = 0.0
     for n in range(count):
         total += x[a + n] * y[b + n]
@@ -23,21 +23,21 @@ def dot(x, a, y, b, count):
 
 
 LANES = 16
-"""Divisor of the padded number of neurons of a hidden layer: loops over all of it become vector
-instructions, twice as fast as over 15 neurons."""
+"""The number of neurons of a hidden layer is padded to a multiple of this. Loops over all neurons
+then become vector instructions, which are twice as fast as a loop over 15 neurons."""
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"})
 def hidden(activation, nz, lanes, room, z, v):
-    """Values σ(v) and slopes σ'(v) of all neurons, v = Wz z + bz, behind room for v, maybe unused.
+    """Write values σ(v) and slopes σ'(v) of all neurons, v = Wz z + bz, behind the place of v.
 
     Args:
-        room: array that begins with Wzᵀ and bz, each of ``lanes`` entries a row.
-        v: position of v in it.
+        room: array that begins with Wzᵀ and bz, with ``lanes`` entries in each row.
+        v: position of v in ``room``; v itself need not be written.
     """
-    # The compiler turns loops over all neurons into vector instructions. σ stands in the loop that
-    # computes v, as vectors stored in one loop and read in the next take 20 ns to arrive. Numbers
-    # are addressed by their positions: a view takes 2 ns to make.
+    # The compiler turns loops over all neurons into vector instructions. The loop that computes v
+    # also computes σ, as vectors stored in one loop and read in the next take 20 ns to arrive.
+    # Numbers are addressed by their positions, as making a view takes 2 ns.
     if activation == TANH:
         _over(_tanh, nz, lanes, room, z, v)
     elif activation == SIGMOID:
@@ -52,7 +52,7 @@ def hidden(activation, nz, lanes, room, z, v):
 
 @njit(nogil=True, inline="always")
 def _over(sigma, nz, lanes, room, z, v):
-    """Make the loop ``hidden`` of one activation."""
+    """Make the loop that ``hidden`` runs for one activation."""
     bz, h = nz * lanes, v + lanes
     s, z0 = h + lanes, z[0]
     if nz == 1:
@@ -75,8 +75,8 @@ def _over(sigma, nz, lanes, room, z, v):
             room[h + n], room[s + n] = sigma(room[v + n])
 
 
-# σ(v) and σ'(v) of one neuron; NaN stays. Callers set numpy's error model, as a division that is
-# checked for zero is not turned into vector instructions.
+# σ(v) and σ'(v) of one neuron; NaN stays NaN. Callers set numpy's error model, as a division with a
+# check for zero is not turned into vector instructions.
 
 
 @njit(nogil=True, inline="always")
@@ -146,9 +146,9 @@ _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9, _C10, _C11, _C12, _C13 = (
 def _exp(v):
     """Exponential for v <= 0, to rounding: exp(v) = 2^k exp(r) with |r| <= ln(2) / 2.
 
-    It has neither branch nor table, and is faster than the library's exp in a loop over neurons.
+    Without branches or tables, it is faster than the library's exp in a loop over neurons.
     """
-    v = v if v > _LOWEST else _LOWEST  # NaN, too
+    v = v if v > _LOWEST else _LOWEST  # also for NaN
     t = v * _PER_OCTAVE + _ROUNDED
     k = t - _ROUNDED
     r = (v - k * _HIGH) - k * _LOW

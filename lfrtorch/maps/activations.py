@@ -1,7 +1,7 @@
-"""Activations of a network: a row of the table has all that the package knows of one.
+"""Activations of a network: a row of the table has all that the package knows of an activation.
 
-A new activation takes a row here, and its loop with slope in ``activation_kernel``. Compiled code
-is no part of the row, since its cache notices changes of its own file alone.
+A new activation needs a row here, and a function of value and slope in ``activation_kernel``.
+Compiled code is not part of the row, since its cache only notices changes of its own file.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lfrtorch.maps import activation_kernel as compiled
 from lfrtorch.maps.operations import Formula
 
 FAR = 1e100
-"""Number in place of infinity: its products are finite, and every bounded σ is at its limit."""
+"""Number in place of infinity: its products are finite, and every bounded σ has its limit there."""
 
 
 @dataclass(frozen=True)
@@ -31,15 +31,15 @@ class Activation:
         code: the number of its machine code.
         value: σ(v).
         slope: σ'(v) from v and h.
-        mean_slope: (σ(v + d) - σ(v)) / d without cancellation, σ'(v) for d = 0, of arrays of one
-            shape.
+        mean_slope: (σ(v + d) - σ(v)) / d without cancellation, or σ'(v) if d = 0; v and d are
+            arrays of the same shape.
         extremes, slope_extremes: points v of the extremes of σ and of σ'.
-        c: σ(v[i]) and σ'(v[i]) in C, from v and h; a v that is not a number stays one.
+        c: σ(v[i]) and σ'(v[i]) in C, from v and h; NaN must stay NaN.
         matlab: σ(v) and σ'(v) in MATLAB, from v and h.
         matlab_mean_slope: lines that compute s = (σ(a) - σ(v)) / d with a = v + d; ``over(a, d)``
             is a / d, and 1 for d = 0.
-        of_number: σ(v) of one number by ``OPERATIONS``. Default: ``value``.
-        meaning: σ as an equation, if its name does not say it.
+        of_number: σ(v) of one number, composed of ``OPERATIONS``. Default: ``value``.
+        meaning: σ as an equation, if its name does not define it.
     """
 
     code: int

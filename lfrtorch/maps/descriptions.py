@@ -1,4 +1,4 @@
-"""Static maps of checkpoints, from the descriptions of ``StaticMap.describe``."""
+"""Static maps of checkpoints, made from the descriptions that ``StaticMap.describe`` returns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Direct sum of static maps: each has inputs and outputs of its own."""
+"""Direct sum of static maps, each with its own inputs and outputs."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class DirectSum(StaticMap):
         return torch.cat([part(z[..., own]) for part, own, _, _ in self._placed()], dim=-1)
 
     def equations(self, z: Sequence[Any], phi: Sequence[Any]) -> Sequence[Any]:
-        """Output w of z and φ, single numbers each."""
+        """Output w from z and φ, which are sequences of numbers."""
         return [
             each for part, own, _, weights in self._placed()
             for each in part.equations(z[own], phi[weights])
@@ -80,7 +80,7 @@ class DirectSum(StaticMap):
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Sizes of the last part, with the neurons of all."""
+        """Sizes of the last part, with the number of neurons of all parts."""
         neurons = sum(part.sizes.get("nn", 0) for part in self.maps)
         return {name: neurons if name == "nn" else n for name, n in self.maps[-1].sizes.items()}
 
@@ -125,7 +125,7 @@ class DirectSum(StaticMap):
         ]
 
     def across_branches(self) -> dict[str, Bool[Tensor, ...]]:
-        """None, if each part is a branch."""
+        """No entries, if each part is a branch with one z and one w."""
         return {} if set(self.sizes_of_parts) == {(1, 1)} else super().across_branches()
 
     @property
@@ -163,8 +163,8 @@ class DirectSum(StaticMap):
         made = [code for code in codes if code is not None]
         if len(made) < len(codes):
             return None
-        # A part has its addresses, sizes, number of weights, and the beginnings of its ints,
-        # constants and room.
+        # The head of a part has its addresses, sizes and number of weights, and where its ints,
+        # constants and room begin.
         heads, ints, constants = [], [], []
         first, place = 1 + 9 * len(made), 0
         room = max(part.nw * part.nz for part in self.maps)
@@ -189,7 +189,7 @@ def _named(prefix: str, changes: Callable[..., dict[str, Tensor]]) -> Callable[.
     return named
 
 
-# Arrays of unknown length get any sufficient length: their end is never read.
+# Arrays of unknown length get a length that suffices, as their end is never read.
 _LONG = 1 << 30
 
 

@@ -1,10 +1,10 @@
 """Interval bounds of the values and slopes of neurons, for inputs in a box.
 
-Intervals go through the map: σ of an interval lies between its values at the ends and at the
-extremes inside, and so does σ'. These bounds treat neurons as independent, and are too wide where
-large ones cancel. So the box is cut into cells: bounds of all cells hold in the box. In a cell
-about c the mean value theorem, w ∈ f(c) + J (z - c) with any J within the slopes, gives the
-narrower bounds, the smaller the cell.
+Intervals are propagated through the map: over an interval, σ lies between the least and the largest
+of its values at the ends and at the extremes inside, and so does σ'. These bounds treat neurons as
+independent, and are too wide where large neurons cancel. So the box is cut into cells; the hull of
+the bounds of all cells holds in the box. In a cell about c the mean value theorem gives
+w ∈ f(c) + J (z - c) for some J within the slopes. These bounds are tighter for smaller cells.
 
 References:
     Moore, Kearfott and Cloud, "Introduction to Interval Analysis", SIAM 2009, chapters 5 and 6.
@@ -26,10 +26,10 @@ from lfrtorch._support.types import Array
 from lfrtorch.maps.activations import FAR, Activation
 
 _CELLS = 2**12
-"""Most cells of a box."""
+"""Largest number of cells of a box."""
 
 _ACTIVE = np.linspace(-4.0, 4.0, 17)
-"""Largest |v| for which neurons get cells of their own."""
+"""Values of v at which cells are cut, where neurons bend."""
 
 ROUNDING = 1e-12
 """Widening of intervals, relative to the size of their ends."""
@@ -73,7 +73,7 @@ class Enclosure(NamedTuple):
 
     Args:
         w: bounds of w (nw,), or of w - K z.
-        J: ∂w/∂z (nw, nz).
+        J: bounds of ∂w/∂z (nw, nz).
         centres: middles of cells of the box, (C, nz).
         neurons: s (nn,), left (nw, nn) and right (nn, nz) of J = left diag(s) right, for a network.
     """
@@ -118,7 +118,7 @@ class Layer(NamedTuple):
         w = _product(Ww, _range(sigma.values, sigma.extremes, v))
         linear = _product(K, cells)
         w = Interval(w.low + bw - linear.high, w.high + bw - linear.low)
-        # The mean value theorem about the centre of each cell.
+        # Bounds by the mean value theorem about the centre of each cell.
         steepest = np.maximum(np.abs(J.low - K), np.abs(J.high - K))
         reach = (steepest @ cells.radius[..., None])[..., 0]
         at = sigma.values(centres @ Wz.T + bz) @ Ww.T + bw - centres @ K.T
@@ -139,7 +139,7 @@ class Layer(NamedTuple):
 
 
 def _jacobians(Wz: Float[Array, "nn nz"], Ww: Float[Array, "nw nn"], slopes: Interval) -> Interval:
-    """Jacobian Ww diag(slopes) Wz: an entry is a sum over the neurons."""
+    """Bounds of the Jacobian Ww diag(slopes) Wz, whose entries are sums over the neurons."""
     return _transposed(_product(Ww, _transposed(_scaled(Wz, slopes))))
 
 
@@ -179,7 +179,7 @@ def _hull(each: Interval) -> Interval:
 
 
 def _cells(z: Interval, Wz: Float[Array, "nn nz"], bz: Float[Array, " nn"]) -> Interval:
-    """Cells (C, nz) that cover a box: half of them alike, half where the neurons bend."""
+    """Cells (C, nz) that cover a box: half of the cuts are even, half are where neurons bend."""
     nz = len(z.low)
     each = math.floor(_CELLS ** (1.0 / nz) + 1e-9)
     edges = []

@@ -1,4 +1,4 @@
-"""Formulas with their derivatives, as the text of a language, and as machine code."""
+"""Formulas and their derivatives as source text of a language, and as machine code."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PYTHON = {
         "sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"
     )
 }  # fmt: skip
-"""Operations in Python, of operands that are names or numbers in brackets."""
+"""Operations in Python; operands are names or numbers in brackets."""
 
 SLOPES: dict[str, Callable[..., tuple[Any, ...]]] = {
     "add": lambda w, a, b: (1.0, 1.0), "sub": lambda w, a, b: (1.0, -1.0),
@@ -49,9 +49,9 @@ SLOPES: dict[str, Callable[..., tuple[Any, ...]]] = {
 
 @lru_cache(maxsize=32)
 def with_slopes(formula: Formula) -> Formula:
-    """Table of the results, followed by their derivatives by all inputs, row by row.
+    """Table of the results, followed by the derivatives of each result by all inputs.
 
-    At a kink, as of an absolute value, the derivative is that of one side, or 0.
+    At a kink, such as that of an absolute value, the derivative is that of one side, or 0.
     """
     table = [*formula.rows]
     tangents: list[dict[int, Any]] = []  # nonzero derivatives of each row, by input
@@ -95,7 +95,7 @@ def with_slopes(formula: Formula) -> Formula:
 def statements(
     formula: Formula, inputs: Sequence[str], texts: Mapping[str, str]
 ) -> tuple[list[tuple[str, str]], list[str]]:
-    """Names and expressions of temporaries in order, and the results, in the text of a language.
+    """Names and expressions of temporaries in order, and results, in the syntax of a language.
 
     Args:
         formula: the table to write.
@@ -118,9 +118,9 @@ def statements(
 
 @lru_cache(maxsize=32)
 def machine_code(formula: Formula, *, slopes: bool = False) -> Any:
-    """Compile a function of pointers (v, out); derivatives follow the results with ``slopes``.
+    """Compile a function of pointers (v, out); with ``slopes``, derivatives follow the results.
 
-    Kernels take it as an argument, and are compiled once for all of them.
+    Kernels take the function as an argument, so they are compiled once for all formulas.
     """
     from numba import cfunc, types
 

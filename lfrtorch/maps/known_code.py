@@ -1,7 +1,7 @@
-"""A known model in machine code: one step of it, and its derivatives.
+"""A known model in machine code: one step and its derivatives.
 
 Formulas are called by their addresses, see ``formula_code.machine_code``. Signals v = [x; u; p] are
-in physical units, z and w are normalised.
+in physical units; z and w are normalised.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ DISCRETE, EULER, RK4 = range(3)
 
 
 def known_value(ints, constants, weights, z, w, room):
-    """Write w = [x+; y] of z = [x; u]; y is taken after ``before`` of the substeps.
+    """Write w = [x+; y] of z = [x; u]; y is computed after ``before`` of the substeps.
 
-    ``ints`` has the addresses of f and h and of both with slopes, then nx, nz, nw, the number of
-    parameters, the method, the substeps and those before the output. ``constants`` has the step,
-    then offsets and scales of z and w, and the scales of the parameters.
+    ``ints`` has the addresses of f and h, and of both with slopes, then nx, nz, nw, the numbers of
+    parameters, method, substeps, and substeps before the output. ``constants`` has the step, then
+    offsets and scales of z and w, and the scales of the parameters.
     """
     f, h, nx, nz, nw, P = ints[0], ints[1], ints[4], ints[5], ints[6], ints[7]
     method, substeps, before, step = ints[8], ints[9], ints[10], constants[0]

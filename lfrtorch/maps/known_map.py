@@ -23,7 +23,7 @@ from lfrtorch.maps.operations import Formula
 from lfrtorch.maps.static_map import StaticMap
 
 METHODS = {"discrete": DISCRETE, "euler": EULER, "rk4": RK4}
-"""Methods of one sample: f gives the next state, or the rates, which are integrated."""
+"""Methods for one sample: f returns the next state, or rates that are integrated."""
 
 
 class KnownEquations(NamedTuple):
@@ -36,8 +36,8 @@ class KnownEquations(NamedTuple):
         inputs: number of inputs u.
         method: one of ``METHODS``.
         substeps: steps of the integration in a sample, or in half a sample with ``centred``.
-        centred: inputs are held from half a sample before to half a sample after their own; x is
-            then the state half a sample before.
+        centred: True if inputs are held from half a sample before to half a sample after their
+            sample; x is then the state half a sample before.
     """
 
     f: Formula
@@ -51,12 +51,12 @@ class KnownEquations(NamedTuple):
     centred: bool = False
 
     def described(self) -> dict[str, Any]:
-        """The equations for JSON."""
+        """The equations as plain values for JSON."""
         return {**self._asdict(), "f": self.f.described(), "h": self.h.described()}
 
     @classmethod
     def of(cls, description: Any) -> KnownEquations:
-        """The equations of a description; anything else is a ValueError."""
+        """The equations of a description; an invalid description raises a ValueError."""
         f, h = (Formula.of(description[name]) for name in ("f", "h"))
         states, names, units = (
             tuple(map(str, description[name])) for name in ("states", "parameters", "units")
@@ -137,7 +137,7 @@ class KnownModel(StaticMap):
 
     @property
     def outputs_have_parameters(self) -> bool:
-        """True if y depends on parameters directly, and not through the states alone."""
+        """True if y depends on parameters directly, not only through the states."""
         return max(self.physics.h.used, default=0) >= self.nz
 
     @property
@@ -155,7 +155,7 @@ class KnownModel(StaticMap):
         return (torch.stack(w, -1) - self.of_w[:, 0]) / self.of_w[:, 1]
 
     def equations(self, z: Sequence[Any], phi: Sequence[Any]) -> Sequence[Any]:
-        """Output w of z and φ, single numbers each."""
+        """Output w from z and φ, which are sequences of numbers."""
         ends = (self.of_z, self.of_w)
         of_z, of_w = (each.detach().double().cpu().tolist() for each in ends)
         v = [offset + scale * each for each, (offset, scale) in zip(z, of_z, strict=True)]

@@ -21,7 +21,7 @@ from lfrtorch.maps.static_map import StaticMap
 def linearise_map(
     static: StaticMap, z: Float[Tensor, "R T nz"], phi: Float[Tensor, " P"], code: Code | None
 ) -> LinearisedMap:
-    """Linearise a map at z with the weights φ; ``code`` is the map's, if it is already known."""
+    """Linearise a map at z with the weights φ; ``code`` is its machine code, or None for torch."""
     if code is not None and static.nw and has_kernels(z):
         return CompiledMap(z, phi, static.nw, code)
     return TorchMap(static, z, phi)
@@ -85,7 +85,7 @@ class CompiledMap:
 
 
 LinearisedMap = TorchMap | CompiledMap
-"""Either: ∂w/∂z, ∂w/∂φ and products with it at every sample; φ are all weights in their order."""
+"""A linearised map: ∂w/∂z, ∂w/∂φ and products with ∂w/∂φ at every sample, for all weights φ."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

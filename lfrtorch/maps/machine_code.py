@@ -1,7 +1,7 @@
 """Static maps in machine code: functions that the loops over time call by their address.
 
-A loop takes the address as a number, so it is compiled once for all maps. A call costs a tenth of
-what fifteen neurons take. Signals and weights are float64.
+A loop takes the address as a number, so it is compiled once for all maps. A call takes a tenth of
+the time of fifteen neurons. Signals and weights are float64.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Code(NamedTuple):
     Args:
         prepare, value, slope: addresses of functions of the types ``PREPARE``, ``VALUE`` and
             ``SLOPE``; 0 if there is nothing to prepare.
-        ints, constants: numbers that they need beside the weights.
-        room: number of float64 entries of their scratch array, which keeps the preparation.
+        ints, constants: numbers that these functions need beside the weights.
+        room: number of float64 entries of their scratch array, which holds prepared numbers.
         keep: objects that must live as long as the addresses.
     """
 
@@ -58,7 +58,7 @@ class Code(NamedTuple):
 
 
 NOTHING = Code(0, 0, 0, np.zeros(0, np.int64), np.zeros(0), 0)
-"""Code of no map; it is never called."""
+"""Code in place of a missing map; it is never called."""
 
 
 @cache
@@ -74,7 +74,7 @@ _KEPT: list[Any] = []
 
 
 def _called(*names: str) -> Any:
-    """Compile a call of an address; arrays pass the address of their data, numbers their value."""
+    """Compile a call of an address; arrays are passed by address, numbers by value."""
     whole, double = ir.IntType(64), ir.DoubleType().as_pointer()
     kinds = {"ints": whole.as_pointer(), "stride": whole}
     types_of = [kinds.get(name, double) for name in names]

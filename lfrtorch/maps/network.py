@@ -28,12 +28,12 @@ class Network(StaticMap):
     """Network with one hidden layer: w = Ww σ(Wz z + bz) + bw.
 
     Args:
-        nz: inputs.
-        nw: outputs.
-        nn: neurons.
-        activation: σ, by its name in ``lfrtorch.maps.activations``: as ``"tanh"``, ``"relu"`` or
-            ``"rbf"``, exp(-v²).
-        device, dtype: as in any torch module, for the weights.
+        nz: number of inputs.
+        nw: number of outputs.
+        nn: number of neurons.
+        activation: σ, by its name in ``lfrtorch.maps.activations``, such as ``"tanh"``, ``"relu"``
+            or ``"rbf"``, which is exp(-v²).
+        device, dtype: device and dtype of the weights, as in any torch module.
 
     Shape:
         Wz: (nn, nz), bz: (nn,), Ww: (nw, nn), bw: (nw,).
@@ -74,7 +74,7 @@ class Network(StaticMap):
         self.reset_parameters()
 
     def reset_parameters(self, generator: torch.Generator | None = None) -> None:
-        """Draw Wz, bz, Ww ~ U(-1, 1), and set bw = 0, as Schoukens and Tóth (2020)."""
+        """Draw Wz, bz, Ww ~ U(-1, 1), and set bw = 0, as in Schoukens and Tóth (2020)."""
         with torch.no_grad():
             for weight in (self.Wz, self.bz, self.Ww):
                 weight.uniform_(-1.0, 1.0, generator=generator)
@@ -100,7 +100,7 @@ class Network(StaticMap):
         return {"nn": self.bz.shape[-1]}
 
     def equations(self, z: Sequence[Any], phi: Sequence[Any]) -> Sequence[Any]:
-        """Output w of z and φ, single numbers each."""
+        """Output w from z and φ, which are sequences of numbers."""
         nn, sigma = self.bz.shape[-1], self.sigma.of_number or self.sigma.value
         at = iter(phi)
         Wz = [[next(at) for _ in range(self.nz)] for _ in range(nn)]
@@ -126,7 +126,7 @@ class Network(StaticMap):
         ]
 
     def across_branches(self) -> dict[str, Bool[Tensor, ...]]:
-        """Weights of the neurons for other z and w than the branch's own."""
+        """Weights of the neurons to and from z and w of other branches."""
         branch = torch.arange(len(self.Wz)) * self.nz // len(self.Wz)
         across = branch[:, None] != torch.arange(self.nz)
         return {"Wz": across, "Ww": across.mT}
@@ -168,7 +168,7 @@ class Network(StaticMap):
 
     @torch.no_grad()
     def beside(self, others: Sequence[StaticMap]) -> StaticMap | None:
-        """Network with the neurons of all, if all have the same activation."""
+        """Network with the neurons of all maps, if all are networks of the same activation."""
         if any({**(other.describe() or {}), **self.sizes} != self.describe() for other in others):
             return None
         maps = [self, *others]
@@ -188,7 +188,7 @@ class Network(StaticMap):
             self.bw.zero_()
 
     def redundant(self, fed: int, ny: int | None = None) -> int:
-        """Number of coordinates of z and w, rows of Wz for unused z, and a constant w."""
+        """Number of parameters without effect: coordinates of z and w, unused z, constant w."""
         nz, nn = min(self.nz, fed), self.bz.shape[-1]
         constant = 0 if ny is None else max(0, self.nw - ny)
         return self.nz * nz + nn * (self.nz - nz) + self.nw**2 + constant
@@ -241,8 +241,8 @@ class Network(StaticMap):
         return f"nz={nz}, nw={nw}, nn={nn}, activation={self.activation!r}"
 
 
-# The scratch array has the weights, padded with zero neurons to a multiple of ``LANES``: Wzᵀ, bz
-# and Ww, row by row. Then follow v, h = σ(v) and s = σ'(v).
+# The scratch array has the weights Wzᵀ, bz and Ww, row by row, padded with zero neurons to a
+# multiple of ``LANES``. Then follow v, h = σ(v) and s = σ'(v).
 
 
 def _prepare(ints, constants, weights, room):

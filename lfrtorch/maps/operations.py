@@ -1,8 +1,8 @@
-"""Functions of scalars as tables of operations, which torch, kernels and exports compute.
+"""Functions of scalars as tables of operations, which torch, kernels and exports evaluate.
 
 A function written with torch's functions is called once with symbols in place of numbers. Its
-operations are recorded, one a row. So a checkpoint holds the function without any code, and every
-export has its equations.
+operations are recorded, one in each row. So a checkpoint stores the function without code, and
+every export can write its equations.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Operation(NamedTuple):
     operands: tuple[int, ...] = ()
     """Rows, counted from 0."""
     number: float = 0.0
-    """Value of a constant, position of an input."""
+    """Value of a constant, or position of an input."""
 
 
 def _softplus(v: Tensor) -> Tensor:
@@ -46,7 +46,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "gt": operator.gt, "ge": operator.ge, "and": torch.logical_and, "or": torch.logical_or,
     "not": torch.logical_not,
 }  # fmt: skip
-"""Operations of a row, besides constants and inputs."""
+"""Operations that a row may have, besides constants and inputs."""
 
 _SAME = {
     "true_divide": "div", "truediv": "div", "divide": "div", "multiply": "mul", "subtract": "sub",
@@ -175,7 +175,7 @@ def _symbol(table: list[Operation], part: Any) -> Symbol:
     try:
         return _appended(table, Operation("constant", number=float(part)))
     except (TypeError, ValueError, RuntimeError):
-        raise UntraceableError(f"it uses {part!r}, which is no single number.") from None
+        raise UntraceableError(f"it uses {part!r}, which is not a single number.") from None
 
 
 def _appended(table: list[Operation], row: Operation) -> Symbol:
@@ -187,7 +187,7 @@ class Formula(NamedTuple):
     """A function of scalars v -> w.
 
     Args:
-        inputs: number of v, which are the first rows.
+        inputs: number of scalars v, which are the first rows.
         rows: operations.
         results: positions of the rows of w.
     """
@@ -201,7 +201,7 @@ class Formula(NamedTuple):
         """Table of a function of ``inputs`` scalars that returns scalars.
 
         Raises:
-            UntraceableError: the function has operations that no table has.
+            UntraceableError: the function uses operations that a table cannot have.
         """
         table = [Operation("input", number=float(i)) for i in range(inputs)]
         found = function(*(Symbol(table, i) for i in range(inputs)))
@@ -234,7 +234,7 @@ class Formula(NamedTuple):
     def evaluated(
         self, inputs: Sequence[Any], operations: dict[str, Callable[..., Any]], constant: Any
     ) -> list[Any]:
-        """Evaluate the results by a library's operations; ``constant`` makes its constants."""
+        """Evaluate the results with the operations of a library; ``constant`` makes constants."""
         values: list[Any] = []
         for row in self.rows:
             if row.name == "input":
@@ -246,13 +246,13 @@ class Formula(NamedTuple):
         return [values[i] for i in self.results]
 
     def __call__(self, *v: Tensor) -> list[Tensor]:
-        """Evaluate w of tensors of one shape."""
+        """Evaluate w for tensors v of the same shape."""
         like = v[0] if v else torch.zeros(())
         found = self.evaluated(v, OPERATIONS, like.new_tensor)
         return [torch.as_tensor(w).expand_as(like) for w in found]
 
     def of_symbols(self, v: Sequence[Symbol]) -> list[Symbol]:
-        """Evaluate w of symbols: the rows are added to their table."""
+        """Evaluate w for symbols v, whose table gets the rows."""
         table = v[0].table
         apply = {name: partial(_applied, table, name) for name in OPERATIONS}
         return [_symbol(table, w) for w in self.evaluated(v, apply, partial(_symbol, table))]
@@ -264,7 +264,7 @@ class Formula(NamedTuple):
 
     @classmethod
     def of(cls, description: Any) -> Formula:
-        """Table of a description; anything else is a ValueError."""
+        """Table of a description; an invalid description raises a ValueError."""
         rows = [Operation(str(n), tuple(map(int, o)), float(v)) for n, o, v in description["rows"]]
         inputs, results = int(description["inputs"]), tuple(map(int, description["results"]))
         for place, row in enumerate(rows):

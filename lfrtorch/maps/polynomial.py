@@ -27,17 +27,18 @@ from lfrtorch.maps.written import Written
 class Polynomial(StaticMap):
     """Polynomial of a total degree: w = C m(z), m(z) = (1, z1, z2, .., z1², z1 z2, ..).
 
-    Affine maps of z and of w change nothing but C.
+    After an affine change of the coordinates of z or w the map is again a polynomial of this
+    degree; only C changes.
 
     Args:
-        nz: inputs.
-        nw: outputs.
+        nz: number of inputs.
+        nw: number of outputs.
         degree: highest total degree.
-        device, dtype: as in any torch module, for the weights.
+        device, dtype: device and dtype of the weights, as in any torch module.
 
     Shape:
-        C: (nw, monomials). There are (nz + degree)! / (nz! degree!) monomials by rising degree; the
-        constant is column 0.
+        C: (nw, monomials). The (nz + degree)! / (nz! degree!) monomials are sorted by rising
+        degree; column 0 is the constant.
 
     Raises:
         ValueError: a degree below 1, or more monomials than there is memory for.
@@ -73,7 +74,7 @@ class Polynomial(StaticMap):
         ]
         number = {factors: n for n, factors in enumerate(monomials)}
         self.growth = [(number[factors[:-1]], factors[-1]) for factors in monomials[1:]]
-        """A pair (m, j) for each monomial but the constant, which is monomial m times z_j."""
+        """A pair (m, j) for each monomial but the constant: it is monomial m times z_j."""
         self.C = Parameter(torch.empty(nw, len(monomials), device=device, dtype=dtype))
         self.reset_parameters()
 
@@ -106,20 +107,20 @@ class Polynomial(StaticMap):
             self.C.zero_()
 
     def redundant(self, fed: int, ny: int | None = None) -> int:
-        """Number of coordinates of z and w, monomials of unused z, and an affine w."""
+        """Number of parameters without effect: coordinates of z and w, unused z, affine w."""
         nz = min(self.nz, fed)
         gone = self.C.shape[-1] - math.comb(nz + self.degree, nz)
         affine = 0 if ny is None else self.nw * nz + max(0, self.nw - ny)
         return self.nz * nz + self.nw * gone + self.nw**2 + affine
 
     def equations(self, z: Sequence[Any], phi: Sequence[Any]) -> Sequence[Any]:
-        """Output w of z and φ, single numbers each."""
+        """Output w from z and φ, which are sequences of numbers."""
         m = self._products(z)
         rows = [phi[q * len(m) : (q + 1) * len(m)] for q in range(self.nw)]
         return [combined(row[1:], m[1:], row[0]) for row in rows]
 
     def _products(self, z: Sequence[Any]) -> list[Any]:
-        """Monomials m(z) of single numbers."""
+        """Monomials m(z) from a sequence of numbers z."""
         m: list[Any] = [1.0]
         for before, j in self.growth:
             m.append(m[before] * z[j] if before else z[j])
@@ -132,14 +133,14 @@ class Polynomial(StaticMap):
 
     @property
     def written(self) -> Written:
-        """Write C times the monomials, each an earlier one times one z."""
+        """Write C times the monomials; each monomial is an earlier monomial times a z."""
         monomials = Formula.traced(lambda *z: self._products(z), self.nz)
         arrays = {"C": self.C, "growth": torch.tensor(self.growth)}
         return Written("polynomial", arrays, lambda a, z: a.affine("C", a.table(monomials, z)))
 
     @property
     def quadrature(self) -> Quadrature:
-        """Exact rule: a slope is a polynomial in t."""
+        """An exact rule, as the slope at z0 + t ζ is a polynomial in t."""
         return Quadrature.gauss_legendre((self.degree + 1) // 2, exact=True)
 
     @property

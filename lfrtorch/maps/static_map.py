@@ -1,8 +1,8 @@
 """Static map of a model, w = f(z; φ), as the rest of the package uses it.
 
-A new map is a class with ``equations``: value, slopes, machine code and exports follow from them.
-``Network`` and others override these with faster code. ``StaticMap()`` is the absence of a map,
-with nz = 0.
+A new map is a class that defines ``equations``, from which value, slopes, machine code and exports
+follow. ``Network`` and others override these with faster code. ``StaticMap()``, with nz = 0, stands
+for no map.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ if TYPE_CHECKING:
 
 
 class Symmetry(NamedTuple):
-    """Change of coordinates of some of z or w that the weights of a map absorb.
+    """Change of coordinates of some entries of z or w that the weights of a map absorb.
 
     Args:
         signal: ``z``, changed as z -> (I + εT) z, or ``w``, changed as w -> (I + εT)⁻¹ w.
         place: positions of the changed entries in z or w.
-        changes: T (n, size, size) and the weights by name -> their changes per ε, (n, *shape).
+        changes: function of T (n, size, size) and the weights by name that returns the changes of
+            the weights per ε, (n, *shape).
     """
 
     signal: Literal["z", "w"]
@@ -70,7 +71,7 @@ class StaticMap(Module):
         self.nz, self.nw = nz, nw
 
     def equations(self, z: Sequence[Any], phi: Sequence[Any]) -> Sequence[Any]:
-        """Output w of z and φ, single numbers each, by operators and torch's functions."""
+        """Output w from z and φ, sequences of numbers, by operators and torch's functions."""
         raise NotImplementedError(f"{type(self).__name__} has no equations.")
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
@@ -88,7 +89,7 @@ class StaticMap(Module):
 
     @property
     def maps(self) -> list[StaticMap]:
-        """Maps of a direct sum, in the order of z and w; a single map is alone."""
+        """Maps of a direct sum, in the order of z and w; otherwise this map alone."""
         return [self]
 
     @property
@@ -111,18 +112,18 @@ class StaticMap(Module):
         return _own(self) if self.nw else None
 
     def beside(self, others: Sequence[StaticMap]) -> StaticMap | None:
-        """Join this map and others to one simpler than a ``DirectSum``; None if there is none."""
+        """One map for this map and others, simpler than a ``DirectSum``; None if there is none."""
         return None
 
     def zero_output(self) -> None:
-        """Set w to 0 by weights from which a fit can leave. A map may ignore this."""
+        """Set w to 0 by weights that a fit can improve. A map may ignore this call."""
 
     def redundant(self, fed: int, ny: int | None = None) -> int:
-        """Number of directions of all weights that change no output, beside those of x.
+        """Number of directions of all weights that change no output, without those of x.
 
         Args:
-            fed: number of signals that enter z, inputs and states.
-            ny: number of outputs, if the model has an affine map beside this one; else None.
+            fed: number of signals (inputs and states) that enter z.
+            ny: number of outputs, if the model has an affine map beside this one; otherwise None.
         """
         return sum((each.place.stop - each.place.start) ** 2 for each in self.symmetries)
 
@@ -140,10 +141,10 @@ class StaticMap(Module):
         """Entries of the weights that are zero where each w is a function of one z.
 
         Raises:
-            ValueError: a map whose zeros make no such functions.
+            ValueError: a map that no zeros turn into such functions.
         """
         raise InputError(
-            "structure is 'parallel', and its map is one of all z; give a network, or "
+            "structure is 'parallel', but each w of the map depends on all z; give a network, or "
             "DirectSum(branches, [(1, 1)] * nz) of lfrtorch.maps.direct_sum."
         )
 
@@ -196,8 +197,8 @@ class StaticMap(Module):
     ) -> Enclosure | None:
         """Bounds of w and its slopes over a box z (nz,); None if none are known.
 
-        Interval ``a`` bounds ``right`` z of the neurons in addition. If ``K`` is given, w - K z is
-        bounded instead of w.
+        The interval ``a`` is a further bound of the neurons' ``right`` z. If ``K`` is given,
+        w - K z is bounded instead of w.
         """
         return None
 
@@ -214,7 +215,7 @@ class StaticMap(Module):
 
     @property
     def neurons(self) -> Neurons | None:
-        """Scalar functions of which the map is composed, with exact mean slopes."""
+        """Scalar functions that the map is composed of, with exact mean slopes."""
         return None
 
     @property
@@ -224,7 +225,7 @@ class StaticMap(Module):
 
     @property
     def written(self) -> Written | None:
-        """Form of the map for exports; None if torch alone can compute it."""
+        """Form of the map for exports; None if only torch can compute it."""
         formula = self.formula
         if formula is None:
             return None
@@ -242,7 +243,7 @@ class StaticMap(Module):
 
         try:
             return Formula.traced(of, self.nz)
-        except NotImplementedError:  # error of the map, or of a part of it
+        except NotImplementedError:  # the map, or a part of it, has no equations
             return None
 
 
@@ -271,7 +272,7 @@ class OwnModule(StaticMap):
 
     @property
     def code(self) -> Code | None:
-        """Machine code: none."""
+        """None, as there is no machine code."""
         return None
 
     @property
@@ -294,7 +295,7 @@ def _own(module: Module) -> dict[str, Any]:
 
 
 def _is_changed(kind: type) -> bool:
-    """Tell if a class overrides the forward pass to which its equations or code belong."""
+    """Tell if a class overrides the forward pass of its equations or code."""
     order = [each.__dict__ for each in kind.__mro__]
 
     def defined(name: str) -> int:

@@ -1,4 +1,4 @@
-"""Static map for exports: arrays and loops, or a table of operations."""
+"""Static map for exports, as arrays and loops or as a table of operations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lfrtorch.maps.operations import Formula
 
 
 class Vectors(Protocol):
-    """Operations of a language of vectors, which knows the arrays of the map by their names."""
+    """Vector operations of an export language, which refers to arrays of the map by name."""
 
     def affine(self, W: str, v: Any, b: str = "") -> Any:
         """Affine map W v + b."""
@@ -31,10 +31,10 @@ class Written(NamedTuple):
 
     Args:
         template: name of the templates of the map in ``export/templates/maps``, for C, Python and
-            MATLAB. They use the attributes of the map.
-        arrays: arrays of those templates by name, for a map of arrays and loops.
-        of: evaluates a language at z -> w, where exports use expressions instead of templates.
-        formula: table of operations of a map that has nothing else.
+            MATLAB. The templates use attributes of the map.
+        arrays: arrays that the templates use, by name, for a map of arrays and loops.
+        of: function (language, z) -> w, for exports that use expressions instead of templates.
+        formula: table of operations, for a map that has nothing else.
     """
 
     template: str

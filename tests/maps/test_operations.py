@@ -93,7 +93,7 @@ def test_overflow_is_infinite_and_no_error():
         (lambda a: [torch.lgamma(a)], "lgamma"),
         (lambda a: [float(a)], "plain number"),
         (lambda a: a, "tuple"),
-        (lambda a: [a * torch.ones(2)], "no single number"),
+        (lambda a: [a * torch.ones(2)], "not a single number"),
         (lambda a: [torch.sqrt(a, out=None)], "out"),
     ],
     ids=["branch", "operation", "float", "single", "vector", "keyword"],
