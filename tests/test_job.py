@@ -177,7 +177,7 @@ def test_a_mean_of_starts_that_predict_predicts(dataset: Dataset):
 
 def test_a_ridge_is_not_chosen_for_a_model_that_has_seen_the_data(dataset: Dataset):
     model = identify(dataset, settings()).model
-    with pytest.raises(ValueError, match=r"ridge is auto, and the model of init_from has seen"):
+    with pytest.raises(ValueError, match=r"ridge is auto, but the model of init_from was fitted"):
         settings(init_from=model, ridge="auto")
 
 
@@ -366,7 +366,7 @@ def test_a_part_of_the_records_begins_the_fit_and_chooses_a_start(dataset: Datas
     said = Said()
     steady = [Record(r.u, r.y, start="periodic") for r in more[:1]]
     identify(Dataset("one", steady, [], []), settings(first_part=0.5), observer=said)
-    assert any("note: first_part is 0.5, and there are 1 training" in t for t in said.texts)
+    assert any("note: first_part is 0.5, and 1 training" in t for t in said.texts)
 
 
 def test_records_in_steady_state_make_the_linear_model():

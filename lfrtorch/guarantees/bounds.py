@@ -311,6 +311,6 @@ def _check(cell: LFRCell, anywhere: Enclosure | None) -> None:
     largest = float(np.abs(np.linalg.eigvals(cell.A.detach().numpy())).max())
     if largest >= 1.0:
         raise InputError(
-            f"A has an eigenvalue of modulus {largest:.6g} and is not stable: small inputs may let "
+            f"A is not stable, with an eigenvalue of modulus {largest:.6g}: a small input may make "
             "states grow without bound.\nA fit with trainer.guarantee=stable keeps the modulus < 1."
         )

@@ -247,8 +247,8 @@ def test_parts_of_a_file_begin_at_their_own_outputs(tmp_path) -> None:
     ("settings", "message"),
     [
         ({"nx": 3, "nn": 2}, "the 2 outputs are the states; give nx=2"),
-        ({"nx": 2, "nn": 2, "nz": 1, "structure": "parallel"}, "4 states for 2 outputs"),
-        ({"nx": 2, "nn": 2, "relaxations": 1}, "3 states for 2 outputs; give nx=2"),
+        ({"nx": 2, "nn": 2, "nz": 1, "structure": "parallel"}, "4 states that its 2 outputs"),
+        ({"nx": 2, "nn": 2, "relaxations": 1}, "outputs do not determine; give nx=2"),
     ],
 )
 def test_what_cannot_be_is_refused(flights: Dataset, settings: dict[str, Any], message: str):

@@ -309,7 +309,7 @@ def test_states_that_w_alone_drives_beside_known_equations(
 
 def test_driven_states_need_a_learned_map():
     known = lfrtorch.Known(lag, states=["h"], parameters={"a": 0.6}, method="discrete")
-    with pytest.raises(InputError, match="has a w that drives their states; give nn=6"):
+    with pytest.raises(InputError, match="has a w to drive their states; give nn=6"):
         Settings(known=known, nn=0, relaxations=1)
 
 

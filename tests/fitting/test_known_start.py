@@ -271,7 +271,7 @@ def test_outputs_are_the_states_of_their_names_and_others_those_that_are_left():
     assert driven("y1", "y2") == ["current", "speed"]
     assert driven("y", states=("level",)) == ["level"]
     with pytest.raises(
-        InputError, match=r"2 state\(s\), current, speed, .* 1 output\(s\), y;\s+call"
+        InputError, match=r"2 state\(s\), current, speed, .* 1 output\(s\), y;\s+name"
     ):
         driven("y")
     with pytest.raises(InputError, match="outputs=, a function"):

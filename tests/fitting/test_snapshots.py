@@ -321,7 +321,7 @@ def test_the_first_process_alone_writes_files(tmp_path: Path):
 @pytest.mark.parametrize(
     ("before", "now", "trainer", "message"),
     [
-        (starts(2), starts(3), LevenbergMarquardt(), r"has 2 start\(s\), and now there are 3"),
+        (starts(2), starts(3), LevenbergMarquardt(), r"has 2 start\(s\), but 3 are given"),
         (starts(1), starts(2)[1:], LevenbergMarquardt(), "had another start"),
         (starts(1), starts(1), LevenbergMarquardt(max_iter=1), "has had 2 iterations, more than "),
         (starts(1), starts(1), Adam(max_iter=3), "another trainer than Adam"),

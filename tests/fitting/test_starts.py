@@ -364,5 +364,5 @@ def test_integrators_leave_z_something_to_see():
     record = Record(u, np.cumsum(u) - u, start="estimated")
     bla = estimate_bla(record, 1, integrators=1)
     assert initialise(bla, record, nz=1, nw=1, nn=2).lfr.cell.Dzu.all()
-    with pytest.raises(ValueError, match="all states integrate, which z must not see; raise nx"):
+    with pytest.raises(ValueError, match="all states integrate, which z may not see; raise nx"):
         initialise(bla, record, nz=1, nw=1, nn=2, z_feedthrough=False)

@@ -328,7 +328,7 @@ def test_records_that_are_not_the_model_s(model: Model, nu: int, ny: int, fs: fl
     with pytest.raises(ValueError, match=f"(?s)lab.*{message}"):
         Problem.of(model, record)
     started = replace(some_records(model)[0], start="given", x0=[1.0])
-    with pytest.raises(ValueError, match=r"x0 of 1 entries and the model 2 states"):
+    with pytest.raises(ValueError, match=r"x0 of 1 entries, but the model has 2 states"):
         Problem.of(model, started)
 
 
