@@ -91,7 +91,7 @@ def equilibrium(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nx"] 
 
 
 def resting_input(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nu"] | None:
-    """The input nearest to u under which an integrating model is at rest, or None."""
+    """An input near u under which an integrating model is at rest, or None."""
     found = _rest(cell, u, u.new_zeros(cell.nx), inputs=cell.nu)
     return None if found is None else found[0]
 

@@ -32,8 +32,8 @@ from lfrtorch.least_squares.shared_problem import problem_of
 from lfrtorch.model.model import Model
 
 EXPLOSION = 100.0
-"""A step is undone if it raises the squared validation error by more than this factor, and to more
-than the error at the start."""
+"""A step is refused if it raises the squared validation error by more than this factor, and to
+more than the error at the start."""
 
 
 class StartDivergesError(InputError):
@@ -67,7 +67,7 @@ class Trainer(Protocol):
         ...
 
     def refused(self, before: Any, after: Any) -> Any:
-        """State to go on from after a step is undone, as its model explodes on validation."""
+        """State to go on from after a step whose model explodes on validation."""
         ...
 
     def prolonged(self, state: Any) -> Any:
@@ -126,7 +126,7 @@ class FitResult:
     """Outcome of a fit; the best iterate is in ``model``.
 
     Args:
-        model: the fitted model: the same object as the start, unless it is a mean.
+        model: the fitted model: the start itself, changed in place, unless it is a mean or has K.
         history: one entry for each iteration, the start first.
         chosen_iteration: the iterate that ``model`` holds.
         seconds: duration of the whole fit. If the fit went on from snapshots, the time before the
