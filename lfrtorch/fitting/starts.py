@@ -103,10 +103,10 @@ def initialise(
         nn, activation: number of neurons of the network, and their function.
         static: the map z -> w in place of the network, which is copied: a ``Network``, a
             ``Polynomial`` or any module from (..., nz) to (..., nw); nn and activation are ignored.
-        method: how the contribution of w is made zero.
+        method: the method that makes the contribution of w zero.
         seed: seed of the random weights.
-        relaxations, modes: how many relaxations (one state each) and modes (two states each) are
-            added to the linear model.
+        relaxations, modes: numbers of relaxations (one state each) and modes (two states each) that
+            are added to the linear model.
         z_feedthrough: True if the input acts on z at once.
         feedthrough: True if the input acts on the output at once; if False, the linear model must
             have D = 0.

@@ -134,7 +134,7 @@ class FitResult:
         seconds_per_iteration: median over the accepted iterations except the first, which may
             include compilation.
         reason: why the search ended, a :class:`lfrtorch.Reason`.
-        detail: what was lost, or which slope is not finite, if ``reason`` needs it.
+        detail: further remark on a lost process, or on a slope that is not finite.
         starts: all starts if there were several, the best first.
         averaged: number of starts whose mean is ``model``; ``history`` and ``chosen_iteration`` are
             those of the best start.
