@@ -142,7 +142,7 @@ def test_a_mean_keeps_a_structure(structure: str):
 
 
 def test_what_is_held_at_two_values_is_refused():
-    with pytest.raises(InputError, match=r"Bw\[0, 0\] is held at 0, and .* holds it at 0.5"):
+    with pytest.raises(InputError, match=r"Bw\[0, 0\] is held at 0 by .* and at 0.5 by"):
         identified(saturating(), structure="wiener", fixed={"Bw": [[0.5], [FREE]]})
 
 

@@ -124,7 +124,7 @@ def test_what_has_no_bound_is_refused():
         analysis.bound(random_model(polynomial_cell(1, 1, 2)), 1.0)
     model = random_model(random_cell())
     for amplitude in (-1.0, np.nan, [1.0, 2.0]):
-        with pytest.raises(ValueError, match=r"amplitude is .*; the model has 1 input"):
+        with pytest.raises(ValueError, match=r"amplitude is .*; give one number for all 1 input"):
             analysis.bound(model, amplitude)
     with pytest.raises(ValueError, match="the model has 2 states"):
         analysis.bound(model, 1.0, x0=[1.0])
