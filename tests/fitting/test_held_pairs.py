@@ -195,6 +195,7 @@ def test_one_map_of_all_z_is_no_parallel_branches():
 
 
 @pytest.mark.parametrize("structure", ["hammerstein", "parallel"])
+@pytest.mark.usefixtures("short_paths")
 def test_sizes_of_a_structure_are_searched(structure: str):
     sizes = {"nz": "auto", "nw": "auto"} if structure == "hammerstein" else {"nz": 2, "nw": 2}
     run = identified(saturating(), structure=structure, nn="auto", **sizes, starts=2)
@@ -203,6 +204,7 @@ def test_sizes_of_a_structure_are_searched(structure: str):
     check_zeros(run.model, "Cz")
 
 
+@pytest.mark.usefixtures("short_paths")
 def test_sizes_are_searched_with_given_entries():
     run = identified(saturating(), fixed={"Cy": [[0.7, FREE]]}, nn="auto", starts=2)
     Cy = run.model.scaler.y_scale[0] * run.model.lfr.cell.Cy[0].detach() * run.fit.averaged
@@ -238,8 +240,21 @@ class Cube(torch.nn.Module):
         return z.pow(3) @ self.W.mT
 
 
+class Cubes(lfrtorch.StaticMap):
+    """The same in equations, of which machine code is made: a search fits many."""
+
+    def __init__(self, nz: int, nw: int) -> None:
+        super().__init__(nz=nz, nw=nw)
+        self.W = torch.nn.Parameter(torch.zeros(nw, nz, dtype=torch.float64))
+
+    def equations(self, z: Any, phi: Any) -> list[Any]:
+        rows = [phi[i * self.nz : (i + 1) * self.nz] for i in range(self.nw)]
+        return [sum(a * b**3 for a, b in zip(row, z, strict=True)) for row in rows]
+
+
+@pytest.mark.usefixtures("short_paths")
 def test_sizes_of_a_map_of_ones_own_are_searched():
-    run = identified(saturating(), static=Cube, nz="auto", nw="auto", starts=1)
+    run = identified(saturating(), static=Cubes, nz="auto", nw="auto", ridge=0.1)
     assert run.choice is not None
     assert {*run.choice.chosen.sizes} == {"nx", "nz", "nw"}
 
@@ -348,6 +363,7 @@ def test_a_mean_of_predictors_keeps_nothing_of_their_systems(options: dict[str, 
     assert Settings(**simulated).averages
 
 
+@pytest.mark.usefixtures("short_paths")
 def test_sizes_are_searched_with_innovations_and_a_structure():
     run = identified(saturating(), structure="wiener", nn="auto", noise="innovation", starts=2)
     assert run.fit.averaged == 1

@@ -338,6 +338,7 @@ def test_another_thing_than_known_equations_is_refused():
     ],
     ids=str,
 )
+@pytest.mark.usefixtures("short_paths")
 def test_what_is_learned_beside_equations_is_searched(grey: lfrtorch.Run, searched: dict[str, Any]):
     """The equations are fitted again without each stretch that judges."""
     run = identified(record(drag=0.3), **searched)
