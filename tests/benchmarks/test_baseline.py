@@ -1,4 +1,5 @@
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -58,9 +59,12 @@ def test_checkout_is_as_fast_as_itself():
     assert (run.returncode == 1) == ("not met" in row)
 
 
-def test_another_folder_than_a_checkout_is_refused(tmp_path: Path):
-    script = ROOT / "benchmarks" / "baseline.py"
-    command = [sys.executable, script, tmp_path]
-    run = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert run.returncode == 2
-    assert "no checkout of lfrtorch" in run.stderr
+def test_another_folder_than_a_checkout_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    monkeypatch.setattr(sys, "argv", ["baseline.py", str(tmp_path)])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(ROOT / "benchmarks" / "baseline.py"), run_name="__main__")
+    assert end.value.code == 2
+    assert "no checkout of lfrtorch" in capsys.readouterr().err

@@ -143,7 +143,7 @@ def test_the_body_turns_as_rotations_do() -> None:
 def test_a_run_has_the_sums_of_the_kind_that_is_left_out(flights: Path) -> None:
     data = nanodrone.load(root=flights, left_out="random")
     short = lfrtorch.LevenbergMarquardt(max_iter=2)
-    settings = lfrtorch.Settings(known=equations(), nx=0, nn=0, horizon=10, trainer=short)
+    settings = lfrtorch.Settings(nx="auto", nz=1, nw=1, nn=2, starts=1, horizon=10, trainer=short)
     run = lfrtorch.identify(data, settings)
     score = run.metrics["scores"]["random"]
     y = [record.y for record in data.tests]
