@@ -56,6 +56,23 @@ def short_paths(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All figures are drawn, of few pixels."""
+    monkeypatch.setattr("lfrtorch.reporting.plots._DPI", 40)
+
+
+@pytest.fixture
+def shorter(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """``shorter(period=..., sweep=...)`` simulates so few samples of the Bouc-Wen system."""
+
+    def shorten(**samples: int) -> None:
+        for name, count in samples.items():
+            monkeypatch.setattr(f"lfrtorch.datasets.boucwen._{name.upper()}", count)
+
+    return shorten
+
+
+@pytest.fixture
 def fast(monkeypatch: pytest.MonkeyPatch) -> Callable[[bool], None]:
     """Quick ways, in a run without them as well; ``fast(False)`` turns them off."""
 

@@ -31,7 +31,7 @@ from lfrtorch.fitting.multistart import cheap_starts
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import StoppedError
-from lfrtorch.reporting import Console, plots, write
+from lfrtorch.reporting import Console, write
 
 SHORT = LevenbergMarquardt(max_iter=4)
 
@@ -308,9 +308,9 @@ def test_the_command_line_calls_the_same_function(tmp_path: Path):
 
 
 @pytest.mark.numeric
+@pytest.mark.usefixtures("coarse")
 def test_a_run_is_written_for_people_and_programs(dataset: Dataset, tmp_path, monkeypatch):
     logged = []
-    monkeypatch.setattr(plots, "_DPI", 40)
     monkeypatch.setattr(SummaryWriter, "add_scalar", lambda _, name, *__: logged.append(name))
     run = identify(dataset, settings())
     write(run, tmp_path / "run", command="a notebook")
@@ -399,10 +399,8 @@ def test_a_part_has_the_shortest_records():
     assert all(np.array_equal(a.y, b.y[: a.samples]) for a, b in zip(short, records, strict=True))
 
 
-def test_a_refit_is_scored_on_tests_and_validation_is_that_before(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(plots, "_DPI", 40)
+@pytest.mark.usefixtures("coarse")
+def test_a_refit_is_scored_on_tests_and_validation_is_that_before(dataset: Dataset, tmp_path: Path):
     run = identify(dataset, settings(refit=True))
     assert run.refit is not None
     assert run.model is run.refit.model

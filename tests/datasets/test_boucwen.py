@@ -45,15 +45,15 @@ def displacement():
 
 
 @pytest.fixture
-def short_sweep(monkeypatch):
+def short_sweep(shorter):
     """The simulated sweep test is of 3000 samples."""
-    monkeypatch.setattr(boucwen, "_SWEEP", 3000)
+    shorter(sweep=3000)
 
 
 @pytest.fixture
-def brief(monkeypatch, short_sweep):
+def brief(shorter, short_sweep):
     """Nothing else that is simulated takes long: transients of 150 samples are left out."""
-    monkeypatch.setattr(boucwen, "_PERIOD", 150)
+    shorter(period=150)
 
 
 def official_files(root, **replaced):

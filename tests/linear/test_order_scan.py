@@ -1,6 +1,6 @@
 """The scan over orders finds the one that was planted, and says what it rests on."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,7 @@ from reference import System, random_system
 from scipy.signal import lfilter
 
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.data.records import Channel, Record, Start
 from lfrtorch.linear import order_fits, order_scan
 from lfrtorch.linear.bla import estimate_bla
@@ -43,6 +44,11 @@ def fake(monkeypatch: pytest.MonkeyPatch, models: Sequence[LinearModel]):
     of_order = {model.nx: model for model in models}
     monkeypatch.setattr(order_scan, "estimate_bla", lambda data, nx, **_: of_order[nx])
     monkeypatch.setattr(order_scan.OrderFits, "of", lambda *_: None)
+
+
+def with_errors(monkeypatch: pytest.MonkeyPatch, errors: Callable[[LinearModel], Array]):
+    """Validation finds these errors of a model, sample by sample, whatever the records."""
+    monkeypatch.setattr(order_scan, "_errors", lambda _records, _scale, model: [errors(model)])
 
 
 def model_of(nx: int, rmse: float, nu: int = 1, ny: int = 1) -> LinearModel:
@@ -110,11 +116,8 @@ def test_lowest_order_within_the_margin_of_the_best_is_chosen(scores, chosen, mo
     """Of validation; a description length has a term for the order as it is."""
     record = record_of(PLANTED, 0)
     fake(monkeypatch, [model_of(nx + 1, score) for nx, score in enumerate(scores)])
-
-    def errors(_records, _scale, model):  # of the same size everywhere, whatever the block
-        return [np.full((100, 1), model.fit.rmse)]
-
-    monkeypatch.setattr(order_scan, "_errors", errors)
+    # Of the same size everywhere, whatever the block.
+    with_errors(monkeypatch, lambda model: np.full((100, 1), model.fit.rmse))  # pyright: ignore
     assert scan_orders(record, [1, 2, 3], validation=record).chosen == chosen
     monkeypatch.setattr(order_scan, "description_length", lambda rmse, *_: rmse)
     assert scan_orders(record, [1, 2, 3]).chosen == int(np.argmin(scores)) + 1
@@ -128,11 +131,11 @@ def test_order_within_one_standard_error_of_the_best_is_chosen(monkeypatch):
 
     def errors_with(spread):
         squares = {1: 1.05 + spread * (blocks - 4.5), 2: np.ones_like(blocks)}
-        return lambda _records, _scale, model: [np.sqrt(squares[model.nx])]
+        return lambda model: np.sqrt(squares[model.nx])
 
-    monkeypatch.setattr(order_scan, "_errors", errors_with(0.06))  # 0.05 is 0.9 standard errors
+    with_errors(monkeypatch, errors_with(0.06))  # 0.05 is 0.9 standard errors
     assert scan_orders(record, [1, 2], validation=record).chosen == 1
-    monkeypatch.setattr(order_scan, "_errors", errors_with(0.04))
+    with_errors(monkeypatch, errors_with(0.04))
     assert scan_orders(record, [1, 2], validation=record).chosen == 2
 
 

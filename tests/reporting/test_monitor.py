@@ -14,7 +14,6 @@ from tensorboard.summary.writer import event_file_writer
 import lfrtorch
 from lfrtorch.data.records import Channel, Record
 from lfrtorch.fitting.trainer import Progress, RestartSummary, Round
-from lfrtorch.reporting import plots
 from lfrtorch.reporting.monitor import Checkpoint, TensorBoard
 
 U = np.random.default_rng(0).standard_normal(100)
@@ -47,8 +46,8 @@ def test_tensorboard_without_a_record_has_scalars_alone(model: lfrtorch.Model, t
 
 
 @pytest.mark.numeric
-def test_tensorboard_holds_scalars_figures_and_texts(model: lfrtorch.Model, tmp_path, monkeypatch):
-    monkeypatch.setattr(plots, "_DPI", 40)
+@pytest.mark.usefixtures("coarse")
+def test_tensorboard_holds_scalars_figures_and_texts(model: lfrtorch.Model, tmp_path):
     board = TensorBoard(tmp_path, RECORD, 0.5 * RECORD.y, every=2)
     for iteration in range(3):
         board(model, step(iteration, damping=0.5))

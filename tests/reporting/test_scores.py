@@ -141,17 +141,18 @@ def test_metrics_are_what_the_model_scores(result):
     json.dumps(metrics, allow_nan=False)
 
 
-def test_pooled_validation_weighs_samples():
+def test_pooled_validation_weighs_samples(result):
     records = [Record(np.zeros(n), np.zeros(n), skip=n - m) for n, m in ((110, 100), (300, 300))]
     data = Dataset("two", [], records, [])
-    evaluation = Evaluation(dataset=data)
+    evaluation = Evaluation(dataset=data, model=result[0].model)
     vars(evaluation)["simulations"] = [
         Response(record, "validation", {"NL-LFR": np.full_like(record.y, error)})
         for record, error in zip(records, (3.0, 4.0), strict=True)
     ]
     expected = math.sqrt((100 * 9 + 300 * 16) / 400)
-    assert report._pooled(evaluation, "rmse") == pytest.approx(expected)
-    assert report._pooled(evaluation, "lti_rmse") is None
+    validation = report.scored(evaluation)["validation"]
+    assert validation["rmse"] == pytest.approx(expected)
+    assert validation["lti_rmse"] is None
 
 
 def test_table_shows_published_results_of_these_sizes_only(result):
