@@ -6,6 +6,7 @@ import sys
 import sysconfig
 import tomllib
 import venv
+from collections.abc import Callable
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -18,7 +19,6 @@ from lfrtorch import _public
 from lfrtorch._support.moved import MOVED
 from lfrtorch.cli.command import COMMANDS, versions
 from lfrtorch.datasets import boucwen, official
-from lfrtorch.reporting import plots
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -140,31 +140,52 @@ HEAVY = ("hydra", "matplotlib", "pandas", "jinja2", "scipy.signal", "scipy.io", 
 """What some functions alone need; together they take more than a second to import."""
 
 
-def loaded(code: str) -> set[str]:
-    """Modules that there are after some code."""
-    printing = f"import sys; {code}; print(*sys.modules)"
+LIGHT = ("Record", "Dataset", "multisine", "nrmse", "InputError")
+"""Names of what computes no model."""
+
+CELL = """
+from lfrtorch.engine.cell import LFRCell
+lfrtorch.identify
+torch.set_default_device("meta")
+LFRCell(1, 1, 2)
+"""
+
+STEPS = {
+    "the package": "import lfrtorch",
+    "light names": "; ".join(f"lfrtorch.{name}" for name in LIGHT),
+    "a job": f"import torch\n{CELL}",
+    "a fit": "import lfrtorch.cli.fit",
+}
+"""Code that one process does step by step."""
+
+
+@pytest.fixture(scope="module")
+def loaded() -> dict[str, set[str]]:
+    """Modules that there are after each step."""
+    code = ["import sys"]
+    for step in STEPS.values():
+        code += [step, "print(*sys.modules)"]
     run = subprocess.run(
-        [sys.executable, "-c", printing], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    return set(run.stdout.split())
+        [sys.executable, "-c", "\n".join(code)],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    names = (set(line.split()) for line in run.stdout.splitlines())
+    return dict(zip(STEPS, names, strict=True))
 
 
-def test_import_takes_what_it_needs_and_no_more():
+def test_import_takes_what_it_needs_and_no_more(loaded: dict[str, set[str]]):
     """Nor does a cell without memory, by which that of a fit is checked, the compiler of torch."""
-    assert "numpy" not in loaded("import lfrtorch")
-    code = "import lfrtorch, torch; lfrtorch.identify; from lfrtorch.engine.cell import LFRCell; "
-    code += "torch.set_default_device('meta'); LFRCell(1, 1, 2)"
-    assert loaded(code).isdisjoint([*HEAVY, "torch._dynamo", "scipy.spatial"])
+    assert "numpy" not in loaded["the package"]
+    assert loaded["a job"].isdisjoint([*HEAVY, "torch._dynamo", "scipy.spatial"])
 
 
-@pytest.mark.parametrize("name", ["Record", "Dataset", "multisine", "nrmse", "InputError"])
-def test_what_computes_no_model_imports_nothing_that_does(name: str):
+def test_what_computes_no_model_imports_nothing_that_does(loaded: dict[str, set[str]]):
     others = {"torch", "scipy", "numba", "safetensors", "jaxtyping", *HEAVY}
-    assert loaded(f"import lfrtorch; lfrtorch.{name}").isdisjoint(others)
+    assert loaded["light names"].isdisjoint(others)
 
 
-def test_a_single_fit_imports_no_tables_of_several():
-    assert loaded("import lfrtorch.cli.fit").isdisjoint(["pandas", "scipy.signal"])
+def test_a_single_fit_imports_no_tables_of_several(loaded: dict[str, set[str]]):
+    assert loaded["a fit"].isdisjoint(["pandas", "scipy.signal"])
 
 
 def test_the_package_shows_its_public_names_and_no_others():
@@ -196,15 +217,16 @@ def test_the_version_names_what_computes():
     assert "Python 3." in said
 
 
-def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("coarse")
+def test_readme_example_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shorter: Callable[..., None]
+) -> None:
     """The eight lines of the README, as they stand."""
     text = (ROOT / "README.md").read_text()
     code = text.split("```python\n")[1].split("```")[0]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(official, "cache", lambda: tmp_path)
-    monkeypatch.setattr(boucwen, "_SWEEP", 3000)  # a test that the README does not score
-    monkeypatch.setattr(boucwen, "_PERIOD", 2048)  # and a quarter of the multisines
-    monkeypatch.setattr(plots, "_DPI", 40)
+    shorter(sweep=3000, period=2048)  # a test that the README does not score, a quarter of others
     defaults = boucwen.load.__kwdefaults__
     assert defaults is not None
     monkeypatch.setitem(defaults, "samples", 2048)
