@@ -876,20 +876,31 @@ def starts(data) -> list[tuple[str, int]]:
 
 @pytest.mark.numeric
 def test_a_record_in_motion_has_an_estimated_start(tmp_path):
-    table = cut_out(tmp_path / "a.csv", 1000)
+    cut_out(tmp_path / "a.csv", 1000)
     data = decided(load_records(tmp_path / "a.csv", **AUTO))
     assert starts(data) == [("estimated", 0), ("estimated", 240), ("estimated", 320)]
     (note,) = data.notes
     assert "at rest, and by" in note
     assert note.endswith("with an estimated start: start is estimated")
-    table[-80:, 1] = 1e3  # outputs of the test choose nothing
-    write(tmp_path / "b.csv", table, "u,y")
-    other = decided(load_records(tmp_path / "b.csv", **AUTO))
-    assert (starts(other), other.notes) == (starts(data), data.notes)
+
+
+def test_what_does_not_estimate_chooses_no_start(tmp_path, monkeypatch):
+    tried = []
+
+    def trial(record):
+        tried.append(record)
+        return StartTrial(1.0, 0.5)
+
+    monkeypatch.setattr(record_start, "try_starts", trial)
+    table = cut_out(tmp_path / "a.csv", 1000)
+    decided(load_records(tmp_path / "a.csv", **AUTO))
+    assert np.array_equal(tried[0].y[:, 0], table[:320, 1])  # without the part that tests
     skipping = decided(load_records(tmp_path / "a.csv", **AUTO, skip=7, test=0))
+    assert np.array_equal(tried[1].y[:, 0], table[:, 1])
     assert starts(skipping) == [("estimated", 7), ("estimated", 320)]
     everything = decided(load_records(tmp_path / "a.csv", **AUTO, test="all"))
     assert (starts(everything), everything.notes) == ([("zero", 20)], ())
+    assert len(tried) == 2
 
 
 @pytest.mark.numeric

@@ -38,12 +38,6 @@ def test_a_start_in_motion_is_estimated():
     assert found.chosen == "estimated"
 
 
-def test_an_estimated_start_does_no_harm_at_rest():
-    found = try_starts(resonance(0))
-    assert found.zero == pytest.approx(found.estimated, rel=0.05)
-    assert found.chosen == "estimated"
-
-
 def test_rest_at_another_level_than_the_mean_is_no_rest():
     """x = 0 is rest at the mean of the input, and the record begins at rest at 0."""
     assert try_starts(resonance(0, level=2.0)).chosen == "estimated"
