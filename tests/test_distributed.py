@@ -200,7 +200,7 @@ def starts() -> tuple[list[Model], list[Record], Record]:
 def spread(ranks: Ranks, folder: Path | None = None) -> FitResult:
     """The fit from these starts, which two processes share."""
     models, train, validation = starts()
-    trainer = LevenbergMarquardt(max_iter=40)
+    trainer = LevenbergMarquardt(max_iter=12)
     latest = [0] * len(models)
 
     def watch(number: int) -> Callable[[Model, Progress], None]:
@@ -300,7 +300,7 @@ def test_starts_that_processes_share_end_as_on_one(both: list[dict[str, Any]], f
 def test_a_longer_fit_of_shared_starts_goes_on_on_one(both: list[dict[str, Any]], folder: Path):
     models, train, validation = starts()
     result = fit(
-        models, train, validation, validation[:50], trainer=LevenbergMarquardt(max_iter=40),
+        models, train, validation, validation[:50], trainer=LevenbergMarquardt(max_iter=12),
         average=2, snapshots=Snapshots(folder / "starts", writes=False),
     )  # fmt: skip
     before = both[0]["spread"]

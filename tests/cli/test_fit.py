@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ import lfrtorch
 from lfrtorch import InputError
 from lfrtorch.cli import claim, command, config, errors, fit, interrupts, run_folder
 from lfrtorch.cli.hydra_versions import instantiate
-from lfrtorch.datasets import boucwen, f16, official
+from lfrtorch.datasets import f16, official
 from lfrtorch.reporting import plots
 
 
@@ -49,19 +50,16 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def short(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+def short(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path_factory: pytest.TempPathFactory,
+    shorter: Callable[..., None],
+) -> None:
     """The Bouc-Wen system is simulated, official files at hand or not, and for short."""
     nothing = tmp_path_factory.mktemp("nothing")
     monkeypatch.setattr(official, "cache", lambda: nothing)
     monkeypatch.setattr(f16, "_TESTS", (2,))  # of three levels of 74 000 samples
-    monkeypatch.setattr(boucwen, "_PERIOD", PERIOD)
-    monkeypatch.setattr(boucwen, "_SWEEP", SWEEP)
-
-
-@pytest.fixture
-def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All figures are drawn, of few pixels."""
-    monkeypatch.setattr(plots, "_DPI", 40)
+    shorter(period=PERIOD, sweep=SWEEP)
 
 
 ROUNDING = 1e-12
@@ -175,7 +173,7 @@ def test_the_paper_cases_are_one_override():
 @pytest.mark.numeric
 @pytest.mark.usefixtures("coarse")
 def test_run_writes_its_folder_and_the_checkpoint_simulates(csv, tmp_path, monkeypatch, capsys):
-    words = [f"hydra.run.dir='{tmp_path}'", *file_overrides(csv), "nx=1"]
+    words = [f"hydra.run.dir='{tmp_path}'", *file_overrides(csv), "nx=1", "nz=1", "nw=1", "nn=4"]
     words += ["starts=1", "trainer.max_iter=20"]
     launched(monkeypatch, *words)
     for name in ("metrics.json", "config.yaml", "model/model.json", "figures/test.png"):
@@ -292,7 +290,8 @@ def test_the_interrupt_key_keeps_the_best_model_and_its_scores(
     capsys: pytest.CaptureFixture[str],
     request: pytest.FixtureRequest,
 ):
-    words = [*file_overrides(csv), "nx=1", "trainer._target_=cli.test_fit.Interrupted"]
+    words = [*file_overrides(csv), "nx=1", "nz=1", "nw=1", "nn=4", "starts=1"]
+    words.append("trainer._target_=cli.test_fit.Interrupted")
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background
     request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     with pytest.raises(SystemExit) as end:
@@ -354,7 +353,7 @@ def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, t
 def test_a_run_of_few_words_is_saved_in_full_and_goes_on(
     csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    words = ["nx=1", "nn=2", "figures=false", "max_iter=1", "fs=10"]
+    words = ["nx=1", "nn=2", "starts=1", "start=zero", "figures=false", "max_iter=1", "fs=10"]
     launched(monkeypatch, str(csv), *words, f"hydra.run.dir={tmp_path}")
     assert "note: inputs=u, outputs=y, by the names of the columns" in capsys.readouterr().out
     assert run_folder.words_of(tmp_path)[:2] == ["data=file", f"data.path={csv}"]
@@ -765,7 +764,8 @@ def test_a_known_model_stands_in_the_working_directory(
         rows.append(f"{value},{level}")
         level += (2.0 * value - 0.8 * level) * (1 - np.exp(-0.08)) / 0.8
     (tmp_path / "x.csv").write_text("\n".join(rows))
-    words = "data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=10 figures=false"
+    words = "data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=10 data.start=zero"
+    words += " starts=1 figures=false"
     known = "known._target_=level_of_a_tank.model", "hydra.run.dir=run"
     launched(monkeypatch, *words.split(), *known)
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())

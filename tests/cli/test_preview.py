@@ -66,7 +66,7 @@ def run(tmp_path, capsys, monkeypatch):
 @pytest.fixture
 def undrawn(monkeypatch):
     """An empty figure, which is written in no time, and no trial of starts."""
-    monkeypatch.setattr(preview, "survey_figure", lambda *_: Figure())
+    monkeypatch.setattr(preview, "survey_figure", lambda *_: Figure(figsize=(0.1, 0.1)))
     monkeypatch.setattr(preview, "beginning", lambda *_: [])
 
 
@@ -329,7 +329,7 @@ def test_user_errors_are_one_message(words, message, file: Path, capsys):
 
 @pytest.mark.numeric
 def test_how_a_fit_would_take_the_record_to_begin(tmp_path: Path, run, monkeypatch):
-    monkeypatch.setattr(preview, "survey_figure", lambda *_: Figure())
+    monkeypatch.setattr(preview, "survey_figure", lambda *_: Figure(figsize=(0.1, 0.1)))
     noise, u = np.random.default_rng(0).standard_normal((2, 1400))
     y = lfilter([1.0], [1, -1.96, 0.9702], u) + 0.5 * noise
     y[1010] = np.nan

@@ -83,7 +83,8 @@ def test_a_run_on_names_of_any_alphabet(csv: Path, tmp_path, monkeypatch, capsys
         "data=file", f"data.path={lab}", f"data.inputs=[{FLOW}]", f"data.outputs=[{LEVEL}]",
         "data.fs=10", "data.start=zero",
     ]  # fmt: skip
-    few = ["nx=1", "nn=2", "trainer.max_iter=1", "bla.max_iter=1", "figures=false", "starts=1"]
+    few = ["nx=1", "nz=1", "nw=1", "nn=2", "starts=1", "trainer.max_iter=1", "bla.max_iter=1"]
+    few.append("figures=false")
     run = tmp_path / "Läufe"
     launched(monkeypatch, *data, *few, f"hydra.run.dir={run}")
     saved = OmegaConf.load(run / "config.yaml")
