@@ -138,11 +138,8 @@ def test_a_model_that_does_not_forget_where_it_began_is_not_called_better(
     "asked",
     [
         {},
-        {"noise": "innovation"},
-        {"init": "paper", "nn": 8},
         {"static": "polynomial", "degree": "auto"},
         {"static": lambda nz, nw: lfrtorch.Network(nz, nw, 3)},
-        {"structure": "hammerstein"},
         {"first_part": 0.5},
     ],
     ids=lambda asked: next(iter(asked), "nothing"),
@@ -159,7 +156,6 @@ def test_a_ridge_is_chosen_beside(asked: dict[str, Any], dataset: Dataset):
     assert run.settings.ridge in [c.ridge for c in run.choice.candidates]
     sizes = [{k: v for k, v in c.sizes.items() if k != "degree"} for c in run.choice.candidates]
     assert all({"nx": 1, "nz": 1, "nw": 1}.items() <= s.items() for s in sizes)
-    assert run.settings.structure == asked.get("structure", "free")
 
 
 @pytest.mark.usefixtures("short_paths")

@@ -983,15 +983,19 @@ def test_a_record_that_tells_nothing_is_from_rest(tmp_path):
 
 
 @pytest.mark.numeric
-def test_gaps_and_references_hinder_no_choice(tmp_path):
+def test_gaps_and_references_hinder_no_choice(tmp_path, monkeypatch):
     table = cut_out(tmp_path / "a.csv", 1000)
     table = np.hstack([table, table[:, :1]])
     table[300, 1] = np.nan
     write(tmp_path / "a.csv", table, "u,y,r")
-    data = decided(load_records(tmp_path / "a.csv", **AUTO, gaps="split", test=0))
-    assert [r.start for r in data.train] == ["estimated"] * 2
     data = decided(load_records(tmp_path / "a.csv", **AUTO, reference="r", test=0))
     assert data.train[0].start == "estimated"
+    tried = []
+    trial = StartTrial(1.0, 0.5)
+    monkeypatch.setattr(record_start, "try_starts", lambda r: tried.append(r.samples) or trial)
+    data = decided(load_records(tmp_path / "a.csv", **AUTO, gaps="split", test=0))
+    assert tried == [300]  # the samples before the gap
+    assert [r.start for r in data.train] == ["estimated"] * 2
 
 
 # --- what is refused ------------------------------------------------------------------------

@@ -52,8 +52,15 @@ def check_zeros(model: Model, *names: str) -> None:
         assert not model.lfr.cell.get_parameter(name)[mask].any(), name
 
 
-@pytest.mark.parametrize("guarantee", [None, "stable", "contracting"])
-@pytest.mark.parametrize("structure", ["hammerstein", "wiener_hammerstein"])
+@pytest.mark.parametrize(
+    ("structure", "guarantee"),
+    [
+        ("hammerstein", None),
+        ("hammerstein", "contracting"),
+        ("wiener_hammerstein", "stable"),
+        ("wiener_hammerstein", "contracting"),
+    ],
+)
 def test_a_structure_with_given_entries(structure: str, guarantee: Any, tmp_path: Path):
     nx = 2 if structure == "hammerstein" else 4
     row = [[0.7] + [FREE] * (nx - 1)]
@@ -86,16 +93,19 @@ def test_integrators_with_given_entries():
     assert run.fit.history[-1].train < run.fit.history[0].train
 
 
+ENTRIES = {"fixed": {"A": [[0.8, FREE], [FREE, FREE]], "Bu": [[FREE], [0.0]]}}
+
+
 @pytest.mark.parametrize(
-    ("options", "names"),
+    ("options", "names", "trainer"),
     [
-        ({"structure": "hammerstein"}, {"Cz"}),
-        ({"structure": "wiener_hammerstein"}, {"A", "Bu", "Bw", "Cz"}),
-        ({"fixed": {"A": [[0.8, FREE], [FREE, FREE]], "Bu": [[FREE], [0.0]]}}, {"A", "Bu"}),
-        ({"z_feedthrough": False}, {"Dzu"}),
+        ({"structure": "hammerstein"}, {"Cz"}, SEARCH),
+        ({"structure": "wiener_hammerstein"}, {"A", "Bu", "Bw", "Cz"}, SEARCH),
+        ({"z_feedthrough": False}, {"Dzu"}, SEARCH),
+        (ENTRIES, {"A", "Bu"}, SEARCH),
+        (ENTRIES, {"A", "Bu"}, lfrtorch.Adam(max_iter=20)),
     ],
 )
-@pytest.mark.parametrize("trainer", [SEARCH, lfrtorch.Adam(max_iter=20)])
 def test_innovations_keep_what_the_system_holds(options: Any, names: set[str], trainer: Any):
     """A, Bu and Bw of a predictor change with K, and those of its system do not."""
     run = identified(saturating(), noise="innovation", **options, trainer=trainer)
@@ -299,10 +309,18 @@ def test_what_stands_beside_known_equations(options: dict[str, Any]):
         assert cell.Dzu[1, 0].item() == 1.0
 
 
-@pytest.mark.parametrize(("driven", "states"), [({"relaxations": 2}, 2), ({"modes": 1}, 2)])
-@pytest.mark.parametrize("acts_on", [["h"], ["y"], ["h", "y"]], ids=str)
+@pytest.mark.parametrize(
+    ("driven", "acts_on"),
+    [
+        ({"relaxations": 2}, ["h"]),
+        ({"relaxations": 2}, ["y"]),
+        ({"relaxations": 2}, ["h", "y"]),
+        ({"modes": 1}, ["h", "y"]),
+    ],
+    ids=str,
+)
 def test_states_that_w_alone_drives_beside_known_equations(
-    driven: dict[str, int], states: int, acts_on: list[str]
+    driven: dict[str, int], acts_on: list[str]
 ):
     """They begin at rest and reach only what the learned part may act on."""
     known = lfrtorch.Known(
@@ -311,8 +329,8 @@ def test_states_that_w_alone_drives_beside_known_equations(
     run = identified(saturating(smooth=12), known=known, nx=1, nn=3, **driven)
     assert run.fit.history[-1].train < run.fit.history[0].train
     cell = run.model.lfr.cell
-    assert cell.nx == 1 + 1 + states
-    assert cell.Cz[0].tolist() == [1.0] + [0.0] * (1 + states)  # the equations see their state
+    assert cell.nx == 1 + 1 + 2
+    assert cell.Cz[0].tolist() == [1.0, 0.0, 0.0, 0.0]  # the equations see their state
     assert not cell.Bw[2:, 0].any()  # and drive no other
     assert not cell.Cz[1].any()
     assert cell.Bw[2:, 1:].any()
