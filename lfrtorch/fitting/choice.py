@@ -138,7 +138,7 @@ class Choice:
         left_out: each record, with its outputs where they were left out, of the linear model and
             of the NL-LFR that was chosen without them, (T, ny), physical units.
         seconds: that it took.
-        average: most members that were asked for.
+        averages: True if the model is a mean, so that each member has its own sizes and ridge.
 
     Example:
         >>> def start(bla, train, sizes, seed):
@@ -155,12 +155,7 @@ class Choice:
     counts: Integers = field(repr=False)
     left_out: Sequence[tuple[Record, Array, Array]] = field(repr=False)
     seconds: float
-    average: int = 1
-
-    @property
-    def averages(self) -> bool:
-        """True if the model is the mean of the members, each with its own sizes and ridge."""
-        return self.average > 1
+    averages: bool = False
 
     @property
     def chosen(self) -> Candidate:
@@ -351,7 +346,7 @@ def choose_sizes(
     own = [np.mean([c.outputs[k] for c in each], axis=0) for k, each in enumerate(nested)]
     seconds = time.perf_counter() - clock
     left_out = study.whole([base.outputs, own])
-    return Choice(tuple(tried), tuple(members), base.nx, counts, left_out, seconds, average)
+    return Choice(tuple(tried), tuple(members), base.nx, counts, left_out, seconds, average > 1)
 
 
 def _no_error(found: Sequence[Candidate]) -> str:
@@ -398,9 +393,8 @@ def _members(
     good = judge.as_good(errors=_ERRORS, most=_MOST)
     near = [tried[best[i]] for i in judge.ranked() if good[i]]
     finite = np.isfinite(squares[best].sum(axis=1)).any()
-    if average > 1 and finite:
-        return near[:average]
-    return [min(near, key=lambda c: c.parameters_net)]
+    mean = average > 1 and finite
+    return near[:average] if mean else [min(near, key=lambda c: c.parameters_net)]
 
 
 class _Linear(NamedTuple):
@@ -515,13 +509,12 @@ class _Study:
             every, ratios = self._alone(next, paths), list[float]()
             for number, own in enumerate(seeds):
                 steps = every[number * FOLDS : (number + 1) * FOLDS]
-                outputs, fresh = [step.through for step in steps], [step.fresh for step in steps]
+                outputs, fresh, remember = zip(*steps, strict=True)
                 squares = self._squares(outputs, fresh)
-                remember = any(step.remembers for step in steps)
-                ratios.append(sqrt(squares.sum() / base))
-                found.append(
-                    Candidate(sizes, own, ridge, parameters, ratios[-1], squares, outputs, remember)
-                )
+                ratio = sqrt(squares.sum() / base)
+                measured = ratio, squares, outputs, any(remember)
+                found.append(Candidate(sizes, own, ridge, parameters, *measured))
+                ratios.append(ratio)
             worse = worse + 1 if min(ratios) > _WORSE * best else 0
             best = min(best, *ratios)
             if worse == 2:

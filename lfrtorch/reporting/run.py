@@ -12,7 +12,7 @@ from lfrtorch.analysis.physical_parameters import PhysicalParameters
 from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.data.dataset import Dataset
 from lfrtorch.data.records import common_unit
-from lfrtorch.fitting.choice import Choice
+from lfrtorch.fitting.choice import Candidate, Choice
 from lfrtorch.fitting.forgetting import Memory
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult
@@ -95,15 +95,12 @@ class Run:
     @property
     def started(self) -> list[str]:
         """Names of the starts: the seed of each, and its sizes if they differ."""
-        if self.choice is None or not self.choice.averages:
-            return [str(seed) for seed in self.settings.seeds]
-        return [f"{c.seed}, {scores.in_words(c.sizes)}" for c in self.choice.members]
+        named = [f"{c.seed}, {scores.in_words(c.sizes)}" for c in self._members]
+        return named or [str(seed) for seed in self.settings.seeds]
 
     @property
-    def _seeds(self) -> Sequence[int]:
-        if self.choice is None or not self.choice.averages:
-            return self.settings.seeds
-        return [member.seed for member in self.choice.members]
+    def _members(self) -> Sequence[Candidate]:
+        return self.choice.members if self.choice is not None and self.choice.averages else ()
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{name}={size}" for name, size in self.model.sizes.items())
@@ -133,6 +130,7 @@ class Run:
         # A refitted model is scored on the tests; validation errors are those before the refit.
         fit, refit, dataset = self.fit, self.refit, self.dataset
         entries = scores.scored(self.evaluation)
+        seeds = [c.seed for c in self._members] or self.settings.seeds
         entries["data"] |= {
             "samples": sum(record.samples for record in dataset.train),
             "seed": dataset.seed,
@@ -162,8 +160,6 @@ class Run:
             "memory": self.memory and self.memory._asdict(),
             "starts": max(1, len(fit.starts)),
             "averaged": fit.averaged,
-            "ranking": [
-                {"seed": self._seeds[start.number], **asdict(start)} for start in fit.starts
-            ],
+            "ranking": [{"seed": seeds[start.number], **asdict(start)} for start in fit.starts],
         }
         return finite(entries)

@@ -56,7 +56,7 @@ def test_dtype_is_followed():
     ("static", "name"), [(Network(3, 1, 2), "static.Wz"), (Polynomial(1, 1, 2), "static.C")]
 )
 def test_a_static_map_of_other_sizes_is_refused(static: Module, name: str):
-    with pytest.raises(ValueError, match=rf"{name} has the shape .* nz=2 and nw=1 it is"):
+    with pytest.raises(ValueError, match=rf"{name} has the shape .* nz=2 and nw=1 it must be"):
         LFRCell(1, 1, 3, 2, 1, static)
 
 

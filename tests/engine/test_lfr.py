@@ -287,5 +287,5 @@ def test_a_parametrised_weight_is_refused_and_a_map_of_torchs_layers_may_have_on
 def test_a_weight_that_was_put_in_with_another_shape_is_refused():
     lfr = small()
     lfr.cell.Bu = torch.nn.Parameter(normal(2, 1))
-    with pytest.raises(ValueError, match=r"Bu has the shape \(2, 1\); with nu=2, .* is \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"Bu has the shape \(2, 1\); with nu=2, .* be \(2, 2\)"):
         lfr(normal(1, 5, 2))

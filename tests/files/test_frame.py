@@ -157,7 +157,7 @@ def test_a_model_simulates_a_frame():
     with pytest.raises(InputError, match="no column 'u1', of the model's inputs"):
         model.simulate(inputs.drop(columns="u1"))
     jitter = pd.Index(np.arange(T) / FS + 0.006 * np.sin(np.arange(T) ** 2))
-    with pytest.raises(InputError, match=r"no even time; Record.from_frame\(df, ..., fs=50\)"):
+    with pytest.raises(InputError, match=r"not an even time; Record.from_frame\(df, ..., fs=50\)"):
         model.simulate(inputs.set_axis(jitter))
     with pytest.raises(InputError, match="fs is 50 Hz and the frame's index says 25 Hz"):
         model.simulate(inputs.iloc[::2])

@@ -143,7 +143,7 @@ def test_an_observer_goes_on_without_outputs():
         ("u has the shape", lambda m, r: m.observer().predict([1.0])),
         ("give finite numbers", lambda m, r: m.observer().predict([1.0, np.nan])),
         ("x0 has the shape", lambda m, r: m.observer(x0=[1.0])),
-        ("give one of them", lambda m, r: m.observer(after=r, x0=[0.0] * 3)),
+        ("give only one of them", lambda m, r: m.observer(after=r, x0=[0.0] * 3)),
         ("no innovation gain K", lambda m, r: replace(m, K=None).observer()),
     ],
 )

@@ -136,9 +136,9 @@ def test_prediction_needs_a_gain(model: LinearModel):
 
 def test_prediction_needs_the_channels_of_the_model(observed: LinearModel):
     u = some_input()
-    with pytest.raises(ValueError, match=r"has 1 input\(s\) and the model 2"):
+    with pytest.raises(ValueError, match=r"has 1 input\(s\), but the model has 2"):
         observed.predict(Record(u[:, :1], u, FS))
-    with pytest.raises(ValueError, match=r"has 1 output\(s\) and the model 2"):
+    with pytest.raises(ValueError, match=r"has 1 output\(s\), but the model has 2"):
         observed.predict(Record(u, u[:, 0], FS))
 
 
