@@ -96,6 +96,12 @@ def _of_ridge(e: Evidence) -> dict[str, Any]:
     return {} if e.ridge or e.given else {"ridge": "auto"}
 
 
+def _ridge(e: Evidence) -> str:
+    if e.ridge and e.searched:  # no ridge helps
+        return "integrators=1 or noise='innovation' if the system integrates or was in a loop"
+    return "a larger ridge" if e.ridge else "ridge=1e-3"
+
+
 def _overfit(e: Evidence) -> str:
     """Tell how far the error grows beyond training, or during it; empty if it does not grow."""
     part, growth = max(e.growths.items(), key=lambda item: item[1], default=("", 0.0))
@@ -208,7 +214,7 @@ _OF_DATA = {
         lambda e: (
             "The model is not usable yet: "
             + "train on inputs as large as the tests', or " * any(n in _far(e) for n in e.diverged)
-            + f"use {_written(_of_ridge(e)) or ('a larger ridge' if e.ridge else 'ridge=1e-3')}."
+            + f"use {_written(_of_ridge(e)) or _ridge(e)}."
         ),
         lambda e: f"the NL-LFR diverges on {_listed(map(repr, e.diverged))}",
         _of_ridge,

@@ -76,7 +76,8 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
     [
         ("diverges", {"diverged": ["sweep"]}, "use ridge='auto'."),
         ("diverges", {"diverged": ["sweep"], "continued": True}, "use ridge=1e-3."),
-        ("diverges", {"diverged": ["sweep"], "ridge": True}, "larger ridge"),
+        ("diverges", {"diverged": ["sweep"], "ridge": True, "searched": False}, "larger ridge"),
+        ("diverges", {"diverged": ["sweep"], "ridge": True}, "or noise='innovation' if"),
         ("diverges", {"diverged": [f"sweep {k}" for k in range(99)]}, "use ridge='auto'"),
         ("starts_in_a_transient", {"transient": 4.0, "free": 0.9}, "skip=N"),
         ("nothing_held_out", {"validation": None, "linear_validation": None}, "hold out"),
