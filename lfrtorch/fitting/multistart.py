@@ -264,10 +264,7 @@ def _fitted(
     _check(starts, watching, average)
     ridges = [*ridges] * len(starts) if len(ridges) == 1 else ridges
     if len(ridges) != len(starts):
-        raise InputError(
-            f"there are {len(starts)} models and {len(ridges)} ridges; give one, or each model its "
-            "own."
-        )
+        raise InputError(f"{len(ridges)} ridges for {len(starts)} models; give one, or as many.")
     validation, selection = (
         [*map(with_window, as_records(some))] if some else [] for some in (validation, selection)
     )

@@ -401,5 +401,5 @@ def test_each_start_may_have_its_own_ridge():
     first, second = sorted(result.starts, key=lambda start: start.number)
     assert first.train == pytest.approx(fit(alone, train, trainer=few).starts[0].train, rel=1e-6)
     assert second.train > first.train
-    with pytest.raises(ValueError, match="2 models and 3 ridges"):
+    with pytest.raises(ValueError, match="3 ridges for 2 models"):
         fit(models, train, ridge=[0.0, 1.0, 2.0])
