@@ -10,9 +10,9 @@ from an estimated state, as on new data. Both errors count alike:
    from where the last one ended, all towards the same start. A start that does not forget where it
    began (``lfrtorch.fitting.forgetting``) takes no part.
 3. Each start takes the largest ridge that does as well as its best one. The model is the mean of
-   the best starts that are not much larger than the smallest good one: it needs no luck to tell
-   the best from its neighbours. Where a mean cannot be, it is of the fewest parameters that do
-   about as well as the best (``lfrtorch.data.paired_blocks``).
+   the best starts, of whatever sizes: it needs no luck to tell the best from its neighbours. Where
+   there is no mean, it has the fewest parameters that do about as well as the best
+   (``lfrtorch.data.paired_blocks``).
 
 The error of a choice is the least of many, and so too small to judge it by. So the choice is made
 again without each of the stretches, and judged on that stretch (nested cross-validation). The
@@ -95,8 +95,6 @@ is small by chance, too."""
 
 _MOST = 1.3
 """Largest ratio of rms errors within which it is as good as the best."""
-
-_LARGER = 2  # net parameters over the fewest of all good starts, at most in a mean
 
 _GAIN = 0.98  # larger sizes are tried as long as the least error falls by more than to this part
 
@@ -191,7 +189,7 @@ LEGEND = """\
 many is smaller than on new data.
 above best: in standard errors of the difference.
 chosen: the model is the mean of these, the best 8 at most with 2 at most and an error up to 30 %
-above the best, and at most twice the net parameters of the smallest such; or that one alone."""
+above the best. Where there is no mean, it is the one of them with the fewest net parameters."""
 
 
 def choice_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
@@ -395,9 +393,8 @@ def _members(
     good = judge.as_good(errors=_ERRORS, most=_MOST)
     near = [tried[best[i]] for i in judge.ranked() if good[i]]
     finite = np.isfinite(squares[best].sum(axis=1)).any()
-    fewest = min(near, key=lambda c: c.parameters_net)
-    few = [c for c in near if c.parameters_net <= _LARGER * fewest.parameters_net]
-    return few[:average] if average > 1 and finite else [fewest]
+    mean = average > 1 and finite
+    return near[:average] if mean else [min(near, key=lambda c: c.parameters_net)]
 
 
 class _Linear(NamedTuple):
