@@ -84,9 +84,8 @@ class Memory(NamedTuple):
             return f"The model forgets where it began{slow}."
         if not np.isfinite(self.apart):
             return "The model runs away from some start states among those of its data."
-        text = (
-            f"from other start states the output stays {percent(self.apart)} of its deviation apart"
-        )
+        far = f"{percent(self.apart)} of its standard deviation"
+        text = f"from other start states the output stays {far} apart"
         if self.visited:
             return f"The model has several rests, all of which the records visit: {text}."
         return f"The model does not forget where it began: {text}, where the records never were."

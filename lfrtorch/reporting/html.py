@@ -124,7 +124,7 @@ def comparisons(evaluation: Evaluation) -> list[str]:
     relative = sorted(row.relative(row.error) or 0.0 for _, row in scored)
     line = (
         f"{len(scored)} {use} errors: {least} to {most} of the linear model's, "
-        f"{percent(relative[0])} to {percent(relative[-1])} of the output's deviation"
+        f"{percent(relative[0])} to {percent(relative[-1])} of the output's standard deviation"
     )
     return [line, *(_line(*item) for item in shown if item not in scored)]
 
@@ -135,9 +135,8 @@ def _line(name: str, row: Row) -> str:
     error, linear = quantities([row.error, row.linear], row.unit)
     beside = of_linear(row.error / row.linear) if row.linear else "not comparable"
     relative = percent(row.relative(row.error))
-    return (
-        f"{name}: error {beside} ({error} against {linear}), {relative} of the output's deviation"
-    )
+    both = f"({error} against {linear})"
+    return f"{name}: error {beside} {both}, {relative} of the output's standard deviation"
 
 
 def _scores(evaluation: Evaluation) -> dict[str, Any]:

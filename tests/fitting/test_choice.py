@@ -114,6 +114,13 @@ def test_sizes_given_are_kept():
         assert ridges
 
 
+def test_smaller_ridges_are_not_tried_after_two_that_are_worse(monkeypatch):
+    monkeypatch.setattr(procedure, "_RIDGES", [(10.0**-k, 2) for k in range(5)])
+    monkeypatch.setattr(procedure, "_WORSE", 0.0)  # all after the first are
+    found = chosen(measured(1.0, 200), given={"nx": 1, "nz": 1, "nw": 1, "nn": 2}, orders=[1])
+    assert {c.ridge for c in found.candidates} == {1.0, 0.1, 0.01}
+
+
 def test_a_ridge_that_is_given_is_that_of_all_fits():
     given = {"nx": 2, "nz": 1, "nw": 1}
     found = chosen(measured(1.0), given=given, orders=[2], ridge={"static": 0.1})

@@ -211,7 +211,7 @@ def test_a_diverging_test_and_a_resting_one_are_said(single: Run):
     page = changed.page()
     assert "test: the NL-LFR diverges" in page.text
     assert "verdict red" in page.classes
-    assert re.search(r"rest: error .* of the output's deviation", page.text)
+    assert re.search(r"rest: error .* of the output's standard deviation", page.text)
     assert not re.search(r"\b(nan|inf|None)\b", page.text)
 
 
