@@ -6,13 +6,11 @@ from an estimated state, as on new data. Both errors count alike:
 
 1. The best linear approximations of several orders, each refined without the stretch.
 2. Nonlinear models from small to large: the first few sizes always, and larger ones as long as one
-   of them lowers the error. Each is fitted from several starts along falling ridges, each ridge
-   from where the last one ended, all towards the same start. A start that does not forget where it
-   began (``lfrtorch.fitting.forgetting``) takes no part.
-3. Each start takes the largest ridge that does as well as its best one. The model is the mean of
-   the best starts, of whatever sizes: it needs no luck to tell the best from its neighbours. Where
-   there is no mean, it has the fewest parameters that do about as well as the best
-   (``lfrtorch.data.paired_blocks``).
+   of them lowers the error. Each is fitted from two starts along falling ridges, each ridge from
+   where the last one ended, all towards the same start, and simulates by the mean of its starts.
+   A start that does not forget where it began (``lfrtorch.fitting.forgetting``) takes no part.
+3. A size takes the largest ridge that does as well as its best one, and the choice takes the
+   fewest parameters that do about as well as the best (``lfrtorch.data.paired_blocks``).
 
 The error of a choice is the least of many, and so too small to judge it by. So the choice is made
 again without each of the stretches, and judged on that stretch (nested cross-validation). The
@@ -52,7 +50,6 @@ from lfrtorch.data.records import Record, Scaler, as_records
 from lfrtorch.distributed import agreed
 from lfrtorch.fitting.folds import Fold, as_folded, folds
 from lfrtorch.fitting.forgetting import forgets
-from lfrtorch.fitting.settings import SEED_STEP
 from lfrtorch.fitting.side_by_side import any_of
 from lfrtorch.fitting.trainer import Stop, StoppedError
 from lfrtorch.fitting.windows import begins_at_outputs, in_windows, windows
@@ -78,7 +75,10 @@ _BLOCKS = 4  # blocks of each stretch: two models are compared by 16 differences
 _RIDGES = ((10.0, 12), (1.0, 12), (0.1, 10), (1e-2, 10), (1e-3, 10), (1e-4, 10), (1e-6, 10))
 """Ridges and the iterations of each."""
 
-_STARTS = 3
+_STARTS = 2
+
+_NEAR = 1.2
+"""Largest ratio of a start's rms training error to the least one, for starts in a mean."""
 
 _SMALL = ({"nz": 1, "nw": 1, "nn": 4, "degree": 3}, {"nz": 2, "nw": 2, "nn": 8, "degree": 3})
 """Sizes that are always tried."""
@@ -90,22 +90,21 @@ _DENSEST = 0.5  # largest number of net parameters for each scored output
 _WORSE = 1.3  # error over the best so far; two worse ridges in a row end the search
 
 _ERRORS = 2.0
-"""Standard errors within which a start or a size is as good as the best: the least of many errors
-is small by chance, too."""
+"""Number of standard errors within which a size counts as good as the best: the least of many
+errors is partly small by chance."""
 
 _MOST = 1.3
-"""Largest ratio of rms errors within which it is as good as the best."""
+"""Largest ratio of rms errors up to which a size counts as good as the best."""
 
 _GAIN = 0.98  # larger sizes are tried as long as the least error falls by more than to this part
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Sizes, a start and a ridge that were tried.
+    """Sizes and a ridge that were tried.
 
     Args:
         sizes: nx, nz, nw, and nn or degree.
-        seed: seed of the start.
         ridge: weight of the squared distance to the start, or weights by group.
         parameters_net: number of parameters, without the gauge directions.
         ratio: rms error in what was left out over that of the linear model.
@@ -116,7 +115,6 @@ class Candidate:
     """
 
     sizes: Sizes
-    seed: int
     ridge: Ridge
     parameters_net: int
     ratio: float
@@ -130,15 +128,13 @@ class Choice:
     """Sizes and ridges by cross-validation.
 
     Args:
-        candidates: all that were tried.
-        members: those whose mean is the model, the best first. A single one has the fewest net
-            parameters that do about as well as the best.
+        candidates: all candidates that were tried.
+        chosen: the candidate with the fewest net parameters among those as good as the best.
         nx: the best order of a linear model.
         counts: samples of each block, (folds, B).
         left_out: each record, with its outputs where they were left out, of the linear model and
             of the NL-LFR that was chosen without them, (T, ny), physical units.
-        seconds: that it took.
-        averages: True if the model is a mean, so that each member has its own sizes and ridge.
+        seconds: duration of the choice.
 
     Example:
         >>> def start(bla, train, sizes, seed):
@@ -150,17 +146,11 @@ class Choice:
     """
 
     candidates: tuple[Candidate, ...]
-    members: tuple[Candidate, ...]
+    chosen: Candidate
     nx: int
     counts: Integers = field(repr=False)
     left_out: Sequence[tuple[Record, Array, Array]] = field(repr=False)
     seconds: float
-    averages: bool = False
-
-    @property
-    def chosen(self) -> Candidate:
-        """The first member."""
-        return self.members[0]
 
     def entries(self) -> list[dict[str, Any]]:
         """Numbers of each candidate, by name."""
@@ -169,18 +159,17 @@ class Choice:
         return [
             {
                 **c.sizes,
-                "seed": c.seed,
                 "ridge": c.ridge,
                 "parameters_net": c.parameters_net,
                 "ratio": c.ratio,
                 "standard_errors_above": float(far),
-                "chosen": any(c is member for member in self.members),
+                "chosen": c is self.chosen,
             }
             for c, far in zip(self.candidates, above, strict=True)
         ]
 
     def table(self) -> str:
-        """One line for each size, with the best of its starts and ridges."""
+        """One line for each size, with the best of its ridges."""
         return f"{tables.table(*choice_table(self.entries()))}\n{LEGEND}"
 
 
@@ -188,8 +177,7 @@ LEGEND = """\
 / linear: rms error where it was left out over the linear model's. It compares sizes: the least of
 many is smaller than on new data.
 above best: in standard errors of the difference.
-chosen: the model is the mean of these, the best 8 at most with 2 at most and an error up to 30 %
-above the best. Where there is no mean, it is the one of them with the fewest net parameters."""
+chosen: the fewest net parameters with 2 at most and an error up to 30 % above the best."""
 
 
 def choice_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
@@ -229,7 +217,6 @@ def choose_sizes(
     ridge: Ridge = 0.0,
     last: str = "nn",
     seed: int = 0,
-    average: int = 1,
     guarantee: Name | None = None,
     horizon: int | None = None,
     watch: Callable[[str], None] = lambda _: None,
@@ -247,8 +234,7 @@ def choose_sizes(
         given: sizes that are known.
         ridge: ridge of all fits. Default: it is chosen, too.
         last: name of the last size, nn or degree; nw if the map has no other.
-        seed: seed of the first start; the others have seed + 1000, seed + 2000.
-        average: most starts that the model is the mean of.
+        seed: seed of the first start; the second has seed + 1000.
         guarantee: guarantee of the trainer.
         horizon: samples ahead that records with a measured start are fitted and judged by. Default:
             they are simulated from the first output on.
@@ -291,8 +277,7 @@ def choose_sizes(
         begun.add(key)
         since = time.perf_counter()
         found = study.candidates(sizes, start, seed, base.total)
-        part = len(found) / (len(path) * _STARTS)
-        left -= study.work(found[0].parameters_net if found else 0) * part
+        left -= study.work(found[0].parameters_net if found else 0) * len(found) / len(path)
         tried.extend(found)
         best = min((c.ratio for c in found), default=nan)
         text = ", ".join(f"{name} {size}" for name, size in sizes.items())
@@ -340,13 +325,12 @@ def choose_sizes(
         )
     counts, base = study.counts, study.best_linear()
     tried = [replace(c, ratio=sqrt(c.squares.sum() / base.total)) for c in tried]
-    every = range(FOLDS)
-    members = _members(tried, every, counts, average)
-    nested = [_members(tried, [j for j in every if j != k], counts, average) for k in every]
-    own = [np.mean([c.outputs[k] for c in each], axis=0) for k, each in enumerate(nested)]
+    chosen = _chosen(tried, range(FOLDS), counts)
+    nested = [_chosen(tried, [j for j in range(FOLDS) if j != k], counts) for k in range(FOLDS)]
+    both = [base.outputs, [each.outputs[k] for k, each in enumerate(nested)]]
     seconds = time.perf_counter() - clock
-    left_out = study.whole([base.outputs, own])
-    return Choice(tuple(tried), tuple(members), base.nx, counts, left_out, seconds, average > 1)
+    left_out = study.whole(both)
+    return Choice(tuple(tried), chosen, base.nx, counts, left_out, seconds)
 
 
 def _no_error(found: Sequence[Candidate]) -> str:
@@ -365,7 +349,7 @@ def _budget(rows: int) -> float:
 def _first(order: int) -> list[int]:
     """Return the orders tried first: the linear model's, one more, and much lower ones."""
     # A linear model takes more states than the system has where the system is nonlinear.
-    return [order, order + 1, *(low for low in (order - 1, 2, 4) if 0 < low < order)]
+    return [order, order + 1, *(low for low in (2, 4) if order > low + 1)]
 
 
 def _larger(sizes: Sizes, given: Mapping[str, int], last: str) -> Iterator[Sizes]:
@@ -377,24 +361,19 @@ def _larger(sizes: Sizes, given: Mapping[str, int], last: str) -> Iterator[Sizes
         yield {**sizes, **{name: size for name, size in change.items() if name not in given}}
 
 
-def _members(
-    tried: Sequence[Candidate], of: Sequence[int], counts: Integers, average: int
-) -> list[Candidate]:
-    """Return the starts whose mean is the model, as some folds judge them, the best first."""
+def _chosen(tried: Sequence[Candidate], of: Sequence[int], counts: Integers) -> Candidate:
+    """Return the fewest parameters that do as well as the best in some folds."""
     squares = np.array([c.squares[list(of)].ravel() for c in tried])
     squares = agreed(torch.from_numpy(squares)).numpy()
     blocks = counts[list(of)].ravel()
-    starts: dict[tuple[int, ...], list[int]] = {}
+    sizes: dict[tuple[int, ...], list[int]] = {}
     for i, candidate in enumerate(tried):
-        starts.setdefault((*candidate.sizes.values(), candidate.seed), []).append(i)
-    # The largest ridge was tried first. Where all diverge, all are as good.
-    best = [own[Judge(squares[own], blocks).first_good()] for own in starts.values()]
-    judge = Judge(squares[best], blocks)
-    good = judge.as_good(errors=_ERRORS, most=_MOST)
-    near = [tried[best[i]] for i in judge.ranked() if good[i]]
-    finite = np.isfinite(squares[best].sum(axis=1)).any()
-    mean = average > 1 and finite
-    return near[:average] if mean else [min(near, key=lambda c: c.parameters_net)]
+        sizes.setdefault(tuple(candidate.sizes.values()), []).append(i)
+    # Of a size the largest ridge was tried first. Where all diverge, all are as good.
+    best = [own[Judge(squares[own], blocks).first_good()] for own in sizes.values()]
+    good = Judge(squares[best], blocks).as_good(errors=_ERRORS, most=_MOST)
+    near = [tried[i] for i, enough in zip(best, good, strict=True) if enough]
+    return min(near, key=lambda c: c.parameters_net)
 
 
 class _Linear(NamedTuple):
@@ -414,7 +393,8 @@ class _Linear(NamedTuple):
 class _Step(NamedTuple):
     """A fit without a stretch at one ridge."""
 
-    through: Array  # the output where it was left out, simulated through; infinite if it is refused
+    cost: float  # in training; infinite if the model is refused
+    through: Array  # the output where it was left out, simulated through
     fresh: Array  # and begun there
     remembers: bool  # True if the model is refused as it does not forget where it began
 
@@ -489,8 +469,7 @@ class _Study:
         linear = self._linear[sizes["nx"]]
         assert linear is not None
         paths, parameters = list[Iterator[_Step]](), 0
-        seeds = [seed + SEED_STEP * i for i in range(_STARTS)]
-        for own, k in product(seeds, range(FOLDS)):
+        for k, own in product(range(FOLDS), (seed + 1000 * i for i in range(_STARTS))):
             try:
                 train = in_windows(self._folds[k].train, self._horizon)
                 model = start(linear.models[k], train, static, own)
@@ -504,19 +483,17 @@ class _Study:
             if parameters > _DENSEST * self.rows:
                 return []
             paths.append(self._path(model, linear, k))
-        found, worse, best = list[Candidate](), 0, np.inf
+        found, worse = list[Candidate](), 0
         for ridge, _ in self._ridges:
-            every, ratios = self._alone(next, paths), list[float]()
-            for number, own in enumerate(seeds):
-                steps = every[number * FOLDS : (number + 1) * FOLDS]
-                outputs, fresh, remember = zip(*steps, strict=True)
-                squares = self._squares(outputs, fresh)
-                ratio = sqrt(squares.sum() / base)
-                measured = ratio, squares, outputs, any(remember)
-                found.append(Candidate(sizes, own, ridge, parameters, *measured))
-                ratios.append(ratio)
-            worse = worse + 1 if min(ratios) > _WORSE * best else 0
-            best = min(best, *ratios)
+            every = self._alone(next, paths)
+            steps = [every[k * _STARTS : (k + 1) * _STARTS] for k in range(FOLDS)]
+            outputs, fresh = zip(*map(_mean, steps), strict=True)
+            squares = self._squares(outputs, fresh)
+            remember = any(all(step.remembers for step in own) for own in steps)
+            ratio = sqrt(squares.sum() / base)
+            best = min((c.ratio for c in found), default=np.inf)
+            found.append(Candidate(sizes, ridge, parameters, ratio, squares, outputs, remember))
+            worse = worse + 1 if ratio > _WORSE * best else 0
             if worse == 2:
                 break
         return found
@@ -542,10 +519,9 @@ class _Study:
         return found
 
     def _path(self, model: Model, linear: _Linear, k: int) -> Iterator[_Step]:
-        """Yield the outputs left out at each ridge."""
+        """Yield the cost in training and the outputs left out at each ridge."""
         # Nothing here looks at what is measured where it is left out.
         fold, train = self._folds[k], self._folds[k].train
-        lost = np.full_like(linear.outputs[k], np.inf)
         if self._horizon is not None:
             train = windows(train, self._horizon, model.lfr.cell.nx, y_scale=model.scaler.y_scale)
         longest = max(record.samples for record in fold.train)
@@ -553,7 +529,8 @@ class _Study:
         try:
             problem = Problem.of(model, train, guarantee=guarantee)
         except InputError:  # it diverges on what it is fitted to
-            yield from [_Step(lost, lost, False)] * len(self._ridges)
+            lost = np.full_like(linear.outputs[k], np.inf)
+            yield from [_Step(np.inf, lost, lost, False)] * len(self._ridges)
             return
         theta = problem.theta
         # Start states at one ridge are near those at the next.
@@ -587,7 +564,8 @@ class _Study:
                 remembers = stable and not forgets(model, train, linear.models[k]).right
                 through = [simulated(record) for record in self._records]
                 both = fold.left_out(through), fold.begun_again(through, simulated)
-            yield _Step(*(both if stable and not remembers else (lost, lost)), remembers)
+            cost = state.cost if stable and not remembers else np.inf
+            yield _Step(cost, *both, remembers)
 
     def _check(self) -> None:
         """End if that is asked for."""
@@ -642,3 +620,12 @@ def _refined(model: LinearModel, fold: Fold) -> LinearModel:
     if begins_at_outputs(fold.train):
         return measured_states_model(fold.train)
     return refined_near(model, fold.train)
+
+
+def _mean(steps: Sequence[_Step]) -> tuple[Array, Array]:
+    """Return the mean outputs of the starts whose cost, infinite if unstable, is near the least."""
+    least = min(step.cost for step in steps)
+    near = [(step.through, step.fresh) for step in steps if step.cost <= _NEAR**2 * least < np.inf]
+    lost = np.full_like(steps[0].through, np.inf)
+    outputs, fresh = (np.mean(each, axis=0) for each in zip(*(near or [(lost, lost)]), strict=True))
+    return outputs, fresh

@@ -1,8 +1,8 @@
-"""The stage after a fit: that to all estimation records."""
+"""Stages after a fit: a mean without poor starts, and a fit to all estimation records."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import cast
@@ -12,13 +12,36 @@ import torch
 from lfrtorch._support.reasons import CUT_SHORT, Reason
 from lfrtorch._support.tables import quantity
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
-from lfrtorch.data.records import common_unit
+from lfrtorch.data.records import Record, common_unit
 from lfrtorch.distributed import agreed
 from lfrtorch.fitting.first_fit import cost_in_full
+from lfrtorch.fitting.means import mean_model
+from lfrtorch.fitting.prediction import predicting
 from lfrtorch.fitting.refit import refit
 from lfrtorch.fitting.stage import Job, Stage
+from lfrtorch.fitting.state_scaling import scale_states
 from lfrtorch.fitting.trainer import FitResult, StoppedError
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
+
+_AVERAGED = 3
+"""Largest number of starts in a mean that no held-out record has judged. It is above 1, as the
+start with the least training error may be overfitted (``benchmarks/first_try.md``)."""
+
+_POOR = 2.0
+"""Largest ratio of a start's training error to the least one, for starts in such a mean."""
+
+
+class MeanOfGood(Stage):
+    """The mean of a few starts with the least training errors, for a model of chosen sizes."""
+
+    def when(self, job: Job) -> bool:
+        """Tell if no held-out record has judged a mean."""
+        return job.choice is not None and bool(job.result.members)
+
+    def run(self, job: Job) -> Job:
+        """Leave out poor starts."""
+        return replace(job, result=without_poor_starts(job.result, job.dataset.train))
 
 
 class Refit(Stage):
@@ -77,6 +100,27 @@ class Refit(Stage):
             f"{quantity(after, unit)}; validation errors are those before the refit"
         )
         return replace(job, again=again)
+
+
+def without_poor_starts(result: FitResult, train: Sequence[Record]) -> FitResult:
+    """The fit whose mean is taken over a few starts with the least training errors."""
+    members = list(result.members[:_AVERAGED])
+    predicts = result.model.K is not None  # the mean of models has no gain of its own
+    models, data = predicting(members, train) if predicts else (members, train)
+    assert isinstance(models, list)
+    judges = [Problem.judge(model, data) for model in models]
+    costs = torch.tensor([j.evaluate(j.theta).cost for j in judges], dtype=torch.float64)
+    costs = agreed(costs.nan_to_num(torch.inf))  # the simulation of some may run away
+    near = int((costs <= _POOR**2 * costs.min()).sum())
+    if near == len(result.members):
+        return result
+    order = costs.argsort(stable=True)[:near].tolist()
+    mean = models[order[0]] if near == 1 else mean_model([models[i] for i in order])
+    given = any(record.start == "given" for record in data)
+    scale_states(mean, data, keep_coordinates=given)
+    mean = mean.innovation_form() if predicts else mean
+    kept = tuple(members[i] for i in order) if near > 1 else ()
+    return replace(result, model=mean, averaged=near, members=kept)
 
 
 def _whole_or_cut(before: FitResult, again: Callable[[], FitResult]) -> FitResult:

@@ -32,7 +32,7 @@ def mean_model(models: Sequence[Model]) -> Model:
         models: models of the same data; they are copied.
 
     Raises:
-        ValueError: no model, models of other channels, input scales or rates, or a known model.
+        ValueError: no model; models whose channels, scales or rates differ; or a known model.
 
     Example:
         >>> models = [lfrtorch.initialise(bla, record, nz=1, nw=1, nn=4, seed=i) for i in range(3)]
@@ -44,8 +44,8 @@ def mean_model(models: Sequence[Model]) -> Model:
     first = models[0]
     if not all(_alike(model, first) for model in models):
         raise InputError(
-            "the models have other channels, input scales or rates than each other; give models "
-            "that start from the same data."
+            "the models differ in channels, scales or rates; give models that start from the same "
+            "linear model and data."
         )
     if any(model.known_states for model in models):
         raise InputError(
@@ -60,15 +60,8 @@ def mean_model(models: Sequence[Model]) -> Model:
     def stacked(of: Callable[[LFRCell], Tensor]) -> Tensor:
         return torch.cat([of(cell) for cell in cells])
 
-    # Output equations in the first model's scales.
-    y_scale = first.scaler.y_scale
-    units = [torch.as_tensor((m.scaler.y_scale / y_scale)[:, None]).to(cells[0].A) for m in models]
-
-    def outputs(of: Callable[[LFRCell], Tensor]) -> list[Tensor]:
-        return [unit * of(cell) for unit, cell in zip(units, cells, strict=True)]
-
     def beside(of: Callable[[LFRCell], Tensor]) -> Tensor:
-        return torch.cat(outputs(of), dim=1) / count
+        return torch.cat([of(cell) for cell in cells], dim=1) / count
 
     nx, nz, nw = (sum(getattr(cell, n) for cell in cells) for n in ("nx", "nz", "nw"))
     like = {"device": cells[0].A.device, "dtype": cells[0].A.dtype}
@@ -81,15 +74,12 @@ def mean_model(models: Sequence[Model]) -> Model:
         cell.Dzu.copy_(stacked(lambda c: c.Dzu))
         cell.Cy.copy_(beside(lambda c: c.Cy))
         cell.Dyw.copy_(beside(lambda c: c.Dyw))
-        cell.Dyu.copy_(torch.stack(outputs(lambda c: c.Dyu)).mean(dim=0))
-    for name in Matrices._fields:  # frozen ones stay so
+        cell.Dyu.copy_(torch.stack([c.Dyu for c in cells]).mean(dim=0))
+    for name in Matrices._fields:  # matrices that are frozen in all models stay frozen
         frozen = not any(c.get_parameter(name).requires_grad for c in cells)
         cell.get_parameter(name).requires_grad_(not frozen)
     cell.held = _held_beside(cells, dict(cell.named_parameters()))
-    offset = np.mean([model.scaler.y_offset for model in models], axis=0)
-    scaler = replace(first.scaler, y_offset=offset)
-    # Gains of models do not make one of their mean.
-    return replace(first, lfr=LFR(cell), scaler=scaler, K=None)
+    return replace(first, lfr=LFR(cell), K=None)  # the mean of models has no gain of its own
 
 
 def _beside(cells: Sequence[LFRCell]) -> Module | None:
@@ -123,8 +113,8 @@ def _held_beside(cells: Sequence[LFRCell], whole: Mapping[str, Tensor]) -> dict[
 
 
 def _alike(one: Model, other: Model) -> bool:
-    """Tell if two models have the same channels, input scales and rate."""
+    """Tell if two models have the same channels, scales and rate."""
+    scales = zip(vars(one.scaler).values(), vars(other.scaler).values(), strict=True)
     return (one.inputs, one.outputs, one.fs) == (other.inputs, other.outputs, other.fs) and all(
-        np.array_equal(getattr(one.scaler, name), getattr(other.scaler, name))
-        for name in ("u_offset", "u_scale")
+        np.array_equal(*pair) for pair in scales
     )

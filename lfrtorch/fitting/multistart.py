@@ -101,7 +101,7 @@ def fit(
     selection: Record | Sequence[Record] = (),
     *,
     trainer: Trainer | None = None,
-    ridge: Ridge | Sequence[Ridge] = 0.0,
+    ridge: Ridge = 0.0,
     noise: Noise = "output",
     horizon: int | None = None,
     average: int = 1,
@@ -142,8 +142,7 @@ def fit(
             there (``benchmarks/starts.md``). Starts are judged on validation and selection records,
             or on the training records if there are neither.
         trainer: the search. Default: Levenberg-Marquardt.
-        ridge: weight of |θ - θ_start|², see ``lfrtorch.least_squares.problem``; a list gives each
-            model its own.
+        ridge: weight of |θ - θ_start|², see ``lfrtorch.least_squares.problem``.
         noise: where noise acts. ``"output"``: on the outputs; the simulation error is minimised.
             ``"innovation"``: also inside the system; the error of the prediction one sample ahead
             is minimised. All errors are then those of predictions, and the model of the result
@@ -205,13 +204,11 @@ def fit(
     refuse_together(noise=noise, horizon=horizon, guarantee=guarantee)
     options: dict[str, Any] = {
         "trainer": LevenbergMarquardt() if trainer is None else trainer,
+        "ridge": ridge,
         "horizon": horizon,
         "stop": stop,
     }
-    ridges: list[Any] = [*ridge] if isinstance(ridge, list | tuple) else [ridge]
-    found = partial(
-        _fitted, ridges=ridges, average=average, watch=watch, snapshots=snapshots, options=options
-    )
+    found = partial(_fitted, average=average, watch=watch, snapshots=snapshots, options=options)
     models = models if isinstance(models, Model) else _different(models)
     with using(ranks):
         if noise == "output":
@@ -249,7 +246,6 @@ def _fitted(
     validation: Record | Sequence[Record],
     selection: Record | Sequence[Record],
     *,
-    ridges: Sequence[Ridge],
     average: int,
     monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] | None,
     watch: Callable[[Round], None],
@@ -262,9 +258,6 @@ def _fitted(
     given = [monitors] if alone and monitors is not None else monitors
     watching = cast(Sequence[Sequence[Monitor]], given or ())
     _check(starts, watching, average)
-    ridges = [*ridges] * len(starts) if len(ridges) == 1 else ridges
-    if len(ridges) != len(starts):
-        raise InputError(f"{len(ridges)} ridges for {len(starts)} models; give one, or as many.")
     validation, selection = (
         [*map(with_window, as_records(some))] if some else [] for some in (validation, selection)
     )
@@ -280,15 +273,8 @@ def _fitted(
         same_weights(starts)
     with using(sharing):
         fits = [
-            Fit(
-                model,
-                train,
-                validation,
-                ridge=each,
-                **{**options, **own},
-                keep=snapshots.keeper(number),
-            )
-            for number, (model, each) in enumerate(zip(starts, ridges, strict=True))
+            Fit(model, train, validation, **{**options, **own}, keep=snapshots.keeper(number))
+            for number, model in enumerate(starts)
         ]
     if all(one.diverges for one in fits):
         which = "the model diverges" if len(fits) == 1 else "all models diverge"
@@ -350,8 +336,7 @@ def _fitted(
         best = judge.stable(field, as_records(train))[:average]
         mean, count = judge.mean(best)
         if mean is not None:
-            members = tuple(best[:count]) if count > 1 else ()
-            result = replace(result, model=mean, averaged=count, members=members)
+            result = replace(result, model=mean, averaged=count, members=tuple(best[:count]))
     given = any(record.start == "given" for record in (*train, *unseen))
     for model in (result.model, *result.members):
         scale_states(model, train, keep_coordinates=given)
@@ -469,7 +454,7 @@ class _Judge:
         is the mean of all models.
         """
         if not self._records:
-            return (mean_model(best), len(best)) if len(best) > 1 else (next(iter(best), None), 1)
+            return (mean_model(best), len(best)) if len(best) > 1 else (None, 1)
         means = [mean_model(best[:count]) for count in range(2, len(best) + 1)]
         scores = [_cost(self._error(mean)) for mean in means]
         scores = self._same([min(map(self._score, self._fits)), *scores])

@@ -19,7 +19,7 @@ from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.refit import estimation_records
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Job, Stage
-from lfrtorch.fitting.start_models import starting_model
+from lfrtorch.fitting.start_models import STARTS_OF_CHOSEN, starting_model
 from lfrtorch.fitting.windows import begins_at_outputs
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.model import Model
@@ -30,9 +30,6 @@ _CHOOSING = 20_000
 _MORE = 2
 """States beyond the order that one validation part chose, which cross-validation may find worth it:
 a robot's arm has 0.205 of its outputs' standard deviation at order 6, and 0.234 at order 2."""
-
-_MEMBERS = 8
-"""Most starts that a model of chosen sizes is the mean of."""
 
 _ITERATIONS = 75
 """Largest number of iterations of the fit after the choice, which has no validation records: about
@@ -68,11 +65,12 @@ def _of_choice(settings: Settings, choice: Choice) -> Settings:
     sizes = {name: choice.chosen.sizes[name] for name in settings.size_names}
     if settings.known is None:
         sizes["nx"] = choice.chosen.sizes["nx"]
+    averages = settings.averages and allowed("average", STARTS_OF_CHOSEN, vars(settings))
     return replace(
         settings,
         **sizes,
         ridge=choice.chosen.ridge,
-        average=len(choice.members),
+        average=STARTS_OF_CHOSEN if settings.static == "network" and averages else 1,
         refit=False,
         trainer=replace(trainer, max_iter=min(trainer.limit, _ITERATIONS)),
     )
@@ -106,8 +104,6 @@ def _choice(job: Job) -> Choice:
         return with_given(begun, settings.fixed)[0]
 
     searched = settings.nx == "auto"
-    averages = settings.static == "network" and settings.averages and not at_outputs
-    averages = averages and allowed("average", _MEMBERS, vars(settings))
     choice = choose_sizes(
         records,
         [nx for nx in orders if nx <= job.linear.nx + _MORE] if searched else [job.linear.nx],
@@ -117,7 +113,6 @@ def _choice(job: Job) -> Choice:
         ridge=0.0 if settings.ridge == "auto" else settings.ridge,
         last=settings.size_names[-1],
         seed=settings.seed,
-        average=_MEMBERS if averages else 1,
         guarantee="stable" if settings.trainer.guarantee == "stable" else None,
         horizon=settings.horizon,
         watch=observer.say,

@@ -52,11 +52,11 @@ class Job:
         dataset: the same records, with their score windows.
         settings, observer, stop, snapshots: see :func:`lfrtorch.identify`.
         linear: the best linear approximation.
-        begun: that of the order that models start with.
-        order_scan, choice: choice of its order, and of the sizes.
-        models: where the next fit starts.
-        ridge: ridge of the next fit, or that of each model, if it differs from the settings.
-        result, again: the fit, and that to all estimation records.
+        begun: the linear approximation that the models are made from; its order may differ.
+        order_scan, choice: choice of the linear order, and choice of the sizes.
+        models: models that the next fit starts from.
+        ridge: ridge of the next fit, if it differs from the settings.
+        result, again: result of the fit, and of the refit to all estimation records.
     """
 
     given: Dataset
@@ -70,7 +70,7 @@ class Job:
     order_scan: OrderScan | None = None
     choice: Choice | None = None
     models: Sequence[Model] = ()
-    ridge: Ridge | Sequence[Ridge] | None = None
+    ridge: Ridge | None = None
     result: FitResult = _LATER
     again: FitResult | None = None
 

@@ -6,7 +6,7 @@ from lfrtorch.fitting.first_fit import FirstPart
 from lfrtorch.fitting.from_outputs import PARTS, MeasuredStates, ShortWindows
 from lfrtorch.fitting.given_entries import GivenEntries
 from lfrtorch.fitting.known_start import FromEquations, Learned, Parameters
-from lfrtorch.fitting.last_fits import Refit
+from lfrtorch.fitting.last_fits import MeanOfGood, Refit
 from lfrtorch.fitting.linear_start import BestLinear, OutputsAsStates
 from lfrtorch.fitting.sizes import Sizes
 from lfrtorch.fitting.stage import Stage
@@ -27,5 +27,6 @@ STAGES: tuple[Stage, ...] = (
     Learned(),
     FirstPart(),
     WholeFit(),
+    MeanOfGood(),
     Refit(),
 )

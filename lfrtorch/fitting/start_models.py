@@ -10,10 +10,7 @@ from inspect import signature
 import torch
 
 from lfrtorch.data.records import Record
-from lfrtorch.fitting.choice import Choice
-from lfrtorch.fitting.linear_start import approximation, linear_records
 from lfrtorch.fitting.multistart import cheap_starts
-from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.fitting.prediction import without_innovations
 from lfrtorch.fitting.settings import Settings
@@ -24,7 +21,7 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.model import Model, check_channels
 
 STARTS_OF_CHOSEN = 4
-"""Starts of a model of chosen sizes that is no mean, at least."""
+"""Smallest number of starts for a model of chosen sizes; all of them go to the end."""
 
 
 class FromModel(Stage):
@@ -60,8 +57,6 @@ class FromLinear(Stage):
     def run(self, job: Job) -> Job:
         """Make the models."""
         settings, begun = job.settings, job.begun
-        if job.choice is not None and job.choice.averages:
-            return _members(job, job.choice)
         train = in_windows(job.dataset.train, settings.horizon)
         first = starting_model(train, settings, begun, settings.seed)
         count = settings.starts
@@ -70,24 +65,10 @@ class FromLinear(Stage):
             count = cheap_starts(rows, first.parameter_count, settings.trainer.limit)
         if job.choice is not None:
             count = max(STARTS_OF_CHOSEN, count)
+            settings = replace(settings, average=count if settings.average > 1 else 1)
         settings = replace(settings, starts=count)
         more = [starting_model(train, settings, begun, seed) for seed in settings.seeds[1:]]
         return replace(job, settings=settings, models=[first, *more])
-
-
-def _members(job: Job, choice: Choice) -> Job:
-    """The starts that a choice of sizes found, each of its own sizes, with its own ridge."""
-    settings, linear = job.settings, {job.begun.nx: job.begun}
-    records = linear_records(job.dataset.train, settings, Observer())
-    train, models = in_windows(job.dataset.train, settings.horizon), list[Model]()
-    for member in choice.members:
-        nx = member.sizes["nx"]
-        if nx not in linear:
-            linear[nx] = approximation(records, nx, settings)
-        own = replace(settings, **member.sizes)
-        models.append(starting_model(train, own, linear[nx], member.seed))
-    ridges = [member.ridge for member in choice.members]
-    return replace(job, settings=replace(settings, starts=len(models)), models=models, ridge=ridges)
 
 
 def starting_model(

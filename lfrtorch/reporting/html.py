@@ -91,7 +91,7 @@ def render(
         linear=run.linear,
         poles=_poles(run),
         fit=run.fit,
-        starts=starts(run.fit, run.started, common_unit(run.model.outputs)),
+        starts=starts(run.fit, run.settings.seeds, common_unit(run.model.outputs)),
         search=(len(tried), choice_table(tried), LEGEND.splitlines()),
         parameters=[[name, " × ".join(map(str, w.shape)), w.numel()] for name, w in groups],
         stability=stability(run.metrics["stable_to"]),

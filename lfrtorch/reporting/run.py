@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -12,7 +12,7 @@ from lfrtorch.analysis.physical_parameters import PhysicalParameters
 from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.data.dataset import Dataset
 from lfrtorch.data.records import common_unit
-from lfrtorch.fitting.choice import Candidate, Choice
+from lfrtorch.fitting.choice import Choice
 from lfrtorch.fitting.forgetting import Memory
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult
@@ -92,16 +92,6 @@ class Run:
         again = "Refitted to all estimation records: validation errors are those before it."
         return [mean] * (self.fit.averaged > 1) + [again] * (self.refit is not None)
 
-    @property
-    def started(self) -> list[str]:
-        """Names of the starts: the seed of each, and its sizes if they differ."""
-        named = [f"{c.seed}, {scores.in_words(c.sizes)}" for c in self._members]
-        return named or [str(seed) for seed in self.settings.seeds]
-
-    @property
-    def _members(self) -> Sequence[Candidate]:
-        return self.choice.members if self.choice is not None and self.choice.averages else ()
-
     def __repr__(self) -> str:
         sizes = ", ".join(f"{name}={size}" for name, size in self.model.sizes.items())
         return f"Run({self.dataset.name}, {sizes}, {self.fit.outcome})"
@@ -115,7 +105,7 @@ class Run:
         )
         if len(fit.starts) > 1:
             unit = common_unit(self.model.outputs)
-            parts.append(scores.starts_table(fit, self.started, unit) + "\n")
+            parts.append(scores.starts_table(fit, self.settings.seeds, unit) + "\n")
         parts += [f"{said}\n" for said in self.origins]
         parts.append(scores.table(self.evaluation, fit.averaged))
         if self.parameters is not None:
@@ -130,7 +120,6 @@ class Run:
         # A refitted model is scored on the tests; validation errors are those before the refit.
         fit, refit, dataset = self.fit, self.refit, self.dataset
         entries = scores.scored(self.evaluation)
-        seeds = [c.seed for c in self._members] or self.settings.seeds
         entries["data"] |= {
             "samples": sum(record.samples for record in dataset.train),
             "seed": dataset.seed,
@@ -160,6 +149,8 @@ class Run:
             "memory": self.memory and self.memory._asdict(),
             "starts": max(1, len(fit.starts)),
             "averaged": fit.averaged,
-            "ranking": [{"seed": seeds[start.number], **asdict(start)} for start in fit.starts],
+            "ranking": [
+                {"seed": self.settings.seeds[start.number], **asdict(start)} for start in fit.starts
+            ],
         }
         return finite(entries)

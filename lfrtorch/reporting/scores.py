@@ -181,9 +181,10 @@ def own_linear(evaluation: Evaluation) -> list[str]:
 
 
 def in_words(sizes: Mapping[str, int], known_states: int = 0, averaged: int = 1) -> str:
-    """The sizes of a model in words."""
+    """The sizes of a model in words; for a mean, the sizes of each of its models."""
     if averaged > 1:
-        return f"mean of {averaged} models, together {in_words(sizes, known_states)}"
+        each = {name: size // averaged for name, size in sizes.items()}
+        return f"mean of {averaged} models with {in_words(each, known_states // averaged)}"
     if known_states:
         learned = f"; beside it {in_words(sizes)}" if sizes["nz"] else ""
         return f"a known model of {known_states} state(s){learned}"
@@ -194,15 +195,15 @@ def in_words(sizes: Mapping[str, int], known_states: int = 0, averaged: int = 1)
     return f"nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {kind}"
 
 
-def starts_table(result: FitResult, names: Sequence[str], unit: str = "") -> str:
+def starts_table(result: FitResult, seeds: Sequence[int], unit: str = "") -> str:
     """Table of the starts of a fit that ran to the end, and the number of the others."""
-    unit, head, rows, others = starts(result, names, unit)
+    unit, head, rows, others = starts(result, seeds, unit)
     title = f"Starts, RMSE of the best iterate of each{_in_brackets(unit)}"
     return "\n\n".join(part for part in (title, tables.table(head, rows), others) if part)
 
 
 def starts(
-    result: FitResult, names: Sequence[str], unit: str
+    result: FitResult, seeds: Sequence[int], unit: str
 ) -> tuple[str, list[str], list[list[tables.Cell]], str]:
     """Unit, head and rows of the starts that ran to the end, and a sentence on the others."""
     ended = [start for start in result.starts if start.reason != Reason.OTHERS_BETTER]
@@ -210,7 +211,7 @@ def starts(
     factor, unit = tables.engineering([e for each in errors for e in each], unit)
     head = ["seed", "iterations", "training", "validation", "selection", ""]
     rows: list[list[tables.Cell]] = [
-        [names[s.number], s.iterations, *(factor * e for e in each), s.reason]
+        [seeds[s.number], s.iterations, *(factor * e for e in each), s.reason]
         for s, each in zip(ended, errors, strict=True)
     ]
     count = len(result.starts) - len(ended)

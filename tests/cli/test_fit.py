@@ -427,7 +427,7 @@ def test_the_mean_of_starts_is_a_model_of_the_run(csv: Path, tmp_path: Path):
     assert model.sizes == metrics["sizes"]
     page = (tmp_path / "report.html").read_text()
     assert "mean of the best 3" in page
-    assert "mean of 3 models, together nx 3, nz 6, nw 3, 45 neurons" in page
+    assert "mean of 3 models with nx 1, nz 2, nw 1, 15 neurons" in page
     assert (
         "Used: nx 1, nz 2, nw 1, nn 15, ridge 0.0, starts 3, average 3, seed 0, max_iter 3." in page
     )
@@ -581,7 +581,7 @@ def test_sizes_are_chosen(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     cfg = configuration(*file_overrides(csv), *arguments)
     fit.run(cfg, tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
-    chosen = next(t for t in metrics["sizes_search"] if t["chosen"])
+    (chosen,) = (t for t in metrics["sizes_search"] if t["chosen"])
     saved = OmegaConf.load(tmp_path / "config.yaml")
     assert (saved.nx, saved.nz, saved.nn, saved.ridge) == ("auto", "auto", 3, 0.0)
     for used in (saved.used, metrics["used"]):
@@ -609,6 +609,7 @@ def test_the_configuration_of_a_run_of_chosen_sizes_makes_it_again(csv: Path, tm
     assert first["scores"] == again["scores"]
     assert first["ranking"] == again["ranking"]
     assert first["used"] == again["used"]
+    assert first["used"]["average"] > 1
 
 
 @pytest.mark.numeric

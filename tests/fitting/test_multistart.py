@@ -391,15 +391,3 @@ def test_mean_of_starts_is_taken_where_nothing_tells():
     result = fit(models, train, trainer=optimiser, average=3)
     assert result.averaged == 3
     assert result.model.lfr.cell.nx == 3 * models[0].lfr.cell.nx
-
-
-def test_each_start_may_have_its_own_ridge():
-    models, train, _ = several(2)
-    alone, *_ = several(1)
-    few = LevenbergMarquardt(max_iter=5)
-    result = fit(models, train, trainer=few, ridge=[0.0, 1e3], average=2)
-    first, second = sorted(result.starts, key=lambda start: start.number)
-    assert first.train == pytest.approx(fit(alone, train, trainer=few).starts[0].train, rel=1e-6)
-    assert second.train > first.train
-    with pytest.raises(ValueError, match="3 ridges for 2 models"):
-        fit(models, train, ridge=[0.0, 1.0, 2.0])

@@ -211,11 +211,11 @@ def test_neurons_in_words():
     assert report.in_words(sizes) == "nx 2, nz 1, nw 1, a map of one's own"
 
 
-def test_a_mean_is_called_so():
+def test_a_mean_is_called_so_with_the_sizes_of_each_model():
     sizes = {"nx": 6, "nz": 9, "nw": 9, "nn": 48}
-    together = "nx 6, nz 9, nw 9, 48 neurons"
-    assert report.in_words(sizes, averaged=3) == f"mean of 3 models, together {together}"
-    assert report.in_words(sizes) == together
+    each = "nx 2, nz 3, nw 3, 16 neurons"
+    assert report.in_words(sizes, averaged=3) == f"mean of 3 models with {each}"
+    assert report.in_words(sizes).startswith("nx 6")
 
 
 def test_what_was_left_out_in_turn_chose_nothing():
