@@ -35,7 +35,7 @@ def linearise(
     to first order: the error is quadratic in the deviations. u0, y0 and x0 are ``u_offset``,
     ``y_offset`` and ``x_offset`` of the result, and K is the gain of a model in innovation form. So
     a state feedback is u = u0 - F (observer.state - x0). ``to_scipy`` and ``to_control`` of the
-    result convert it. The rest may be unstable: a controller may stabilise it.
+    result convert it. The equilibrium may be unstable: a controller may stabilise it.
 
     Args:
         model: nonlinear.
@@ -121,7 +121,7 @@ def _no_rest(model: Model, u0: Array, still: Tensor | None) -> str:
         near = f"; the offsets are {offsets}.\nGive an input nearer to these"
     else:
         at = levels_of(inputs, scaler.u_offset + scaler.u_scale * still.numpy(), " = ")
-        near = f": the model integrates.\nGive no input for where it stands still, {at}"
+        near = f": the model integrates.\nGive no input to linearise at rest, at {at}"
     return f"{missing}{near}, or a state: linearise(model, u, x=...)."
 
 

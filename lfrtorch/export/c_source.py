@@ -32,8 +32,8 @@ def c_source(
     ``NAME_step`` is one sample in physical units, ``NAME_jacobians`` the matrices of the model
     linearised at a state and an input. ``NAME_reset`` writes the state 0, and ``NAME_rest`` the
     state at rest with the inputs at their operating point, if there is one. If the model knows its
-    reach, ``NAME_reach`` is the square of the surprise index, at most 1 for 99 % of the data of the
-    fit. Sizes and the sampling time are macros, as ``NAME_NX`` and ``NAME_TS``. The code
+    reach, ``NAME_reach`` is a squared distance from the data of the fit, at most 1 for 99 % of
+    them. Sizes and the sampling time are macros, as ``NAME_NX`` and ``NAME_TS``. The code
     allocates nothing and keeps no state of its own.
 
     An observer adds ``NAME_observer_reset``, ``NAME_observer_predict`` and
@@ -82,7 +82,7 @@ _C = {
 
 
 def _slopes(f: Formula) -> Formula:
-    """The derivatives of the results alone, row by row."""
+    """Only the derivatives of the results, without the results, row by row."""
     both = with_slopes(f)
     return both._replace(results=both.results[len(f.results) :]).pruned()
 

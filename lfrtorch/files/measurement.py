@@ -109,7 +109,7 @@ def read_measurement(source: Path | Table, wanted: Wanted) -> Measurement:
         columns, beside = (*columns, *beside), ()
     try:
         values = table.read((*columns, *beside))
-    except InputError:  # further down, a time column that is only compared may hold words
+    except InputError:  # with fs given the time column is only a check; later rows may hold words
         base, beside = base._replace(column=None), ()
         values = table.read(columns)
     values, t = _to_the_end(values, len(columns))

@@ -7,7 +7,7 @@ This is successive halving (Jamieson and Talwalkar) with early decisions. On the
 (16 starts, 5 realisations, 200 iterations) early decisions lose little, as poor starts show at
 once. Later decisions drop the start that would have been the best::
 
-    starts are halved after               least squared validation error, mean   iterations
+    starts are halved after           mean squared error of the best start   iterations
     never (all go to the end)                                             3.37         3026
     1/16 of the iterations                                                3.37         1609
     1/8                                                                   3.37         1696
@@ -88,8 +88,8 @@ ROUNDS = (1 / 16, 1 / 8)
 _MINUTE = 60.0  # seconds that all starts of starts="auto" may take together on one core
 
 AS_GOOD = 1.01
-"""Ratio to the least error up to which a mean of more starts counts as equally good. The least
-error of few starts is partly luck, on the records that chose their iterates."""
+"""Ratio to the least error up to which a mean of more starts counts as equally good. A mean of few
+starts may have the least error by luck: the same records chose the iterates."""
 
 
 @typed("models")
@@ -153,10 +153,10 @@ def fit(
             or from an output if the record has a measured start. Errors are then those in windows.
             Default: whole records.
         average: largest number of starts whose mean is the model of the result
-            (:func:`lfrtorch.mean_model`); at least this many go to the end. The mean is taken over
-            as many of the best starts as keep its error on validation and selection within 1 % of
-            the least, which may be one start; without such records, over all. Starts that diverge
-            when the training input is doubled take no part.
+            (:func:`lfrtorch.mean_model`); at least this many go to the end. The best
+            starts are averaged, as many as keep the error on validation and selection records
+            within 1 % of the least; one start may be best. Without such records all are averaged.
+            Starts that diverge when the training input is doubled take no part.
         monitors: called with the model and its progress after every iteration, one at a time. For
             several models, give a list of monitors for each. Each process calls the monitors it was
             given: give monitors that print or write files to the first process only. Default: a
@@ -448,7 +448,7 @@ class _Judge:
         return [model for model, to in zip(models, reach, strict=True) if to >= max(LOUDER)]
 
     def mean(self, best: Sequence[Model]) -> tuple[Model | None, int]:
-        """Return the mean of the most models whose mean is about as good as the best, and a count.
+        """Average as many models as leave the mean about as good as the best; return both.
 
         The mean is None if a single start is better than all means. Without records to judge on, it
         is the mean of all models.

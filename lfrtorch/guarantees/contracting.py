@@ -1,10 +1,10 @@
 """A fit that keeps a certificate: every iterate is proven to contract, for all inputs.
 
-The inequality of ``certificate`` holds by a margin t, the largest over all P and T. The multiplier
-of the inequality gives the derivative of t by θ. If a step would lead to a point with t <= 0, the
-best step under a linear bound on the decrease of t replaces it. This bound is tightened until t is
-positive at the end of the step. If the end still has no certificate, bisection finds the last point
-on the way there that has one.
+The inequality of ``certificate`` holds by a margin t, maximised over its unknowns P and T. The dual
+variable of this maximisation gives the derivative of t by θ. If a step would lead to a point with
+t <= 0, the best step under a linear bound on the decrease of t replaces it. This bound is tightened
+until t is positive at the end of the step. If the end still has no certificate, bisection finds the
+last point on the way there that has one.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ HALVINGS = 6
 """Number of bisections of a step whose end has no certificate."""
 
 KEPT = 0.1
-"""Part of t that a step should keep, for the next step."""
+"""Fraction of t that is left after a step, so that the next step is not too short."""
 
 
 class Contracting:
@@ -69,7 +69,7 @@ class Contracting:
         return self._cell.map.enclosure(everywhere(self._cell.nz))
 
     def _systems(self, theta: Float[Tensor, " P"]) -> list[Differences]:
-        """The systems of differences at θ, whose matrices the inequality contains."""
+        """Systems at θ of the difference of two trajectories; the inequality has their matrices."""
         parts = theta[: self._size].detach().cpu().double().split([p.numel() for p in self._free])
         for p, part in zip(self._free, parts, strict=True):
             p.data = part.view_as(p)
@@ -112,7 +112,7 @@ class Contracting:
         return last + low * (theta - last)
 
     def bounded(self, theta: Float[Tensor, " P"], system: System) -> System:
-        """The system whose steps from θ keep a certificate; θ has one."""
+        """Bound the equations of a step so that it keeps a certificate, which θ has."""
         self._last = theta.detach().cpu().double()
         found = self._certified(self._last, None) or self._certified(self._last, self._found)
         if found is None:  # θ was rounded to single precision
@@ -191,7 +191,7 @@ class MarginBound:
     def tightened(
         self, step: Float[Tensor, " P"], room: Float[Tensor, " 1"]
     ) -> Float[Tensor, " 1"] | None:
-        """The room to try next if t is not positive after a step; otherwise None."""
+        """A tighter limit on the decrease of t if t is not positive after a step, else None."""
         left = self.after(step)
         if left > 0.0:
             return None

@@ -54,13 +54,13 @@ class OrderScan:
     """Linear models of several orders, and the order that is chosen.
 
     Args:
-        models: one model for each order; the model of the chosen order is a full estimate.
+        models: one model for each order; that of the chosen order is from ``estimate_bla``.
         scores: scores of the orders. With validation records: the rms simulation error on them, or
             in a cross-validation over them and the training records; each output is relative to its
             rms. Otherwise: the error of the fit times M^(p / 2M) (minimum description length), for
             p parameters, initial states included, and M independent equations.
-            The fit of periodic records is to their mean periods, whose error is less than that of
-            their samples.
+            Periodic records are averaged over their periods before the fit, so that its error is
+            less than that of their samples.
         validated: validation records give the scores.
         chosen: the lowest order whose score is within 1 % of the best, or within both one standard
             error and 5 % of it; without validation records the order of the best score.
@@ -174,7 +174,7 @@ def scan_orders(
             if excited < wanted:
                 notes.append(
                     f"orders from {nx} on are left out: the input excites {excited} of the "
-                    f"{wanted} directions that order {nx} has (one a frequency and phase)."
+                    f"{wanted} directions that order {nx} needs (one a frequency and phase)."
                 )
                 break
             model, length = fit(nx)
@@ -190,13 +190,13 @@ def scan_orders(
         fittest = min(tried, key=lambda each: each.length)
         doubt = _doubt(tried[_first(tried)].model, fittest.model, records, judges)
     if doubt:
-        notes.append(f"{doubt}: the order is chosen by cross-validation over both.")
+        notes.append(f"{doubt}: cross-validation over training and validation chooses the order.")
         how, every, tried = "cross-validation", tried, []
         kept = _worthwhile([each.model for each in every])
         if left := [each.model.nx for each in every if each.model.nx not in kept]:
             notes.append(
-                f"orders {left} are left out of it: they fit less than {MARGIN:.0%} better than "
-                "those below."
+                f"orders {left} are left out of the cross-validation: they fit less than "
+                f"{MARGIN:.0%} better than those below."
             )
         every = [each for each in every if each.model.nx in kept]
         folds = _Folds(records, judges, every[-1].model.nx, options)
@@ -271,7 +271,7 @@ def _doubt(
     """Say why validation records tell little of an order; empty if they tell enough.
 
     The judging records chose the order of ``model``. ``fittest`` has the order that fits the
-    training records best, as a poor model errs alike on both.
+    training records best: the errors of a poor model are alike on both, and hide a difference.
     """
     scored = sum(record.samples - record.skip for record in judges)
     memory = memory_of(model, max(record.samples for record in train))
@@ -299,7 +299,7 @@ def memory_of(model: LinearModel, samples: int) -> float:
     squares = np.square(responses).sum(axis=2)  # (samples, ny); every output counts alike
     totals = squares.sum(axis=0)
     mean = np.arange(samples) @ squares / np.where(totals > 0.0, totals, 1.0)
-    return max(1.0, 2.0 * float(mean.max()))  # a decay a^k has a mean of half its time constant
+    return max(1.0, 2.0 * float(mean.max()))  # the mean lag of a^k is half its time constant
 
 
 class _Folds:
@@ -351,7 +351,7 @@ class _Folds:
 
 
 def _united(train: list[Record], judges: list[Record]) -> list[Record]:
-    """Join training and validation records; one that begins with a training record replaces it."""
+    """Join records; a validation record that begins with a training record replaces that one."""
     found = list(train)
     for judge in map(without_coordinates, judges):
         for i, record in enumerate(found):

@@ -126,7 +126,7 @@ class Network(StaticMap):
         ]
 
     def across_branches(self) -> dict[str, Bool[Tensor, ...]]:
-        """Weights of the neurons to and from z and w of other branches."""
+        """Entries that are 0 if each w depends on one z: those between neurons and other pairs."""
         branch = torch.arange(len(self.Wz)) * self.nz // len(self.Wz)
         across = branch[:, None] != torch.arange(self.nz)
         return {"Wz": across, "Ww": across.mT}
@@ -188,7 +188,7 @@ class Network(StaticMap):
             self.bw.zero_()
 
     def redundant(self, fed: int, ny: int | None = None) -> int:
-        """Number of parameters without effect: coordinates of z and w, unused z, constant w."""
+        """Number of redundant parameters: bases of z and w, inputs z not fed, constants of w."""
         nz, nn = min(self.nz, fed), self.bz.shape[-1]
         constant = 0 if ny is None else max(0, self.nw - ny)
         return self.nz * nz + nn * (self.nz - nz) + self.nw**2 + constant

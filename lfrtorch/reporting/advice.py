@@ -35,7 +35,7 @@ class Advice(NamedTuple):
 
     text: str  # the sentence, in at most 160 characters
     evidence: str  # the numbers behind the sentence
-    change: Mapping[str, Any] | None = None  # new fields of the settings; None if none follow it
+    change: Mapping[str, Any] | None = None  # changed settings; None if the advice changes none
     words: str = ""  # words of the command line in place of those of the change
 
     def command(self, before: str) -> str:
@@ -350,7 +350,7 @@ _OF_MODEL = {
             and not (e.useless or e.lost_on_tests)
             and _borne(e, _more_outputs(e))
         ),
-        "Some outputs gain nothing, or are linear: {change}.",
+        "Some outputs gain nothing, or are linear: try {change}.",
         lambda e: (
             f"{e.judged[2]} error relative to the linear model's: "
             + _listed(f"{percent(ratio)} on '{name}'" for name, ratio in e.behind.items())
@@ -396,7 +396,7 @@ _OF_MODEL = {
     ),
     "still_falling": Rule(
         lambda e: e.falling > FALLING and e.validation is not None,
-        "Still falling: {change}, or continue this fit with init_from=RUN.",
+        "The error still falls: {change}, or continue this fit with init_from=RUN.",
         "at the last pace, the validation error falls by {falling:%} in a tenth of the "
         "{iterations} iterations",
         _longer,

@@ -104,7 +104,7 @@ def test_an_integrating_model_is_linearised_where_it_stands_still():
     x = model.simulate(np.tile(local.u_offset, (300, 1)))
     np.testing.assert_allclose(x[-1], x[-2], atol=1e-9)  # under the offset it runs away
     assert abs(local.u_offset - model.scaler.u_offset) > 1e-3
-    with pytest.raises(lfrtorch.InputError, match=r"integrates.\nGive no input for where it"):
+    with pytest.raises(lfrtorch.InputError, match=r"integrates.\nGive no input to linearise at"):
         linearise(model, model.scaler.u_offset)
 
 
