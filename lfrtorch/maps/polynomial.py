@@ -74,7 +74,7 @@ class Polynomial(StaticMap):
         ]
         number = {factors: n for n, factors in enumerate(monomials)}
         self.growth = [(number[factors[:-1]], factors[-1]) for factors in monomials[1:]]
-        """A pair (m, j) for each monomial but the constant: it is monomial m times z_j."""
+        """Pairs (m, j), one for each monomial but the constant; it is monomial m times z_j."""
         self.C = Parameter(torch.empty(nw, len(monomials), device=device, dtype=dtype))
         self.reset_parameters()
 
