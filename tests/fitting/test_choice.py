@@ -102,6 +102,21 @@ def test_a_fold_sees_nothing_of_what_is_left_out():
         assert np.allclose(one.outputs[0], two.outputs[0], rtol=1e-3, atol=1e-3)
 
 
+def test_orders_go_two_beyond_that_of_the_scan(monkeypatch):
+    seen = list[int]()
+
+    def choose(records: Sequence[Record], orders: Sequence[int], *_: Any, **__: Any) -> Choice:
+        seen.extend(orders)
+        raise StoppedError("these are enough")
+
+    monkeypatch.setattr("lfrtorch.fitting.sizes.choose_sizes", choose)
+    dataset = lfrtorch.Dataset("one", [measured(0.0)], [measured(0.0, seed=1)], [])
+    settings = lfrtorch.Settings(nx="auto", nz=1, nw=1, nn="auto")
+    with pytest.raises(StoppedError):
+        lfrtorch.identify(dataset, settings, observer=lfrtorch.Observer())
+    assert seen == [1, 2, 3]
+
+
 @pytest.mark.usefixtures("short_paths")
 def test_sizes_given_are_kept():
     found = chosen(measured(1.0), given={"nx": 2, "nz": 2, "nw": 1, "nn": 3}, orders=[2])
