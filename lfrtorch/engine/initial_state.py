@@ -40,7 +40,8 @@ _ODD = 1e-3
 
 _FAR = 0.1
 """Ratio of squared errors below which a state far from the training data is accepted. Over 50
-measured samples the ratio is at least 0.2 if the state is wrong for the rest of the record."""
+measured samples the ratio of a few states is at least 0.2 if the state is wrong for the rest of
+the record; of 15 states of a mean it is below 0.1, so that a beginning of that size must count."""
 
 _FAR_BETTER = 0.25
 """Ratio of squared errors below which the state from a record's beginning is refined."""
@@ -113,8 +114,8 @@ def estimated_start(
     Least squares alone fits noise and slow model errors if samples are few and states are many. So
     a normal prior adds x0ᵀ P⁻¹ x0 (``state_moments``) to the squared errors over their variance,
     which several passes estimate (``PASSES``). The least squares state is kept in two cases: if it
-    is far better, as a system may begin far from the training data; or if the prior makes no
-    difference, as with far more samples than states. A state from which the model diverges is
+    is far better over at least 8 outputs for each state, as a system may begin far from the
+    training data; or if the prior makes no difference, as with far more samples than states. A state from which the model diverges is
     replaced by rest, if the model does not diverge from rest. ``near`` is the initial state of a
     similar model: the search begins there if its errors are smaller than those from rest.
     """
@@ -148,7 +149,7 @@ def estimated_start(
         prior = _Prior(white, axes * deviations, variance, counted)
         probable = _fitted_start(W, u, y, weight, first, prior, settled=settled)
         squares = _squares(weight, probable, y)
-        far = (_squares(weight, free, y) < _FAR * squares) & (counted > 2 * nx)
+        far = (_squares(weight, free, y) < _FAR * squares) & (counted >= _BEGINNING * nx)
         found = _chosen(~known | ~np.isfinite(squares) | far, free, probable)
     return found.x[:, 0] if last == len(whole[0]) else _staying(W, whole, found.x, white)
 

@@ -12,6 +12,7 @@ import lfrtorch
 from lfrtorch.data.records import Start
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.fitting.means import mean_model
+from lfrtorch.fitting.state_scaling import scale_states
 from lfrtorch.maps.network import Network
 from lfrtorch.maps.polynomial import Polynomial
 from lfrtorch.model.model import Model
@@ -123,6 +124,38 @@ def test_start_of_a_mean_is_most_probable():
         error = (mean_model(several).simulate(record) - clean)[20:60]
         worst.append(np.sqrt(np.mean(error**2)) / noise)
     assert max(worst) < 1.0  # of least squares: 87 to 13000
+
+
+def arm(detuned: float, seed: int) -> Model:
+    """Two lightly damped modes in coordinates of their own."""
+    A = np.zeros((4, 4))
+    for i, (radius, angle) in enumerate(((0.998, 0.11 + detuned), (0.99, 0.5 - 2.0 * detuned))):
+        pole = radius * np.exp(1j * angle)
+        A[2 * i :][:2, 2 * i :][:, :2] = [[pole.real, pole.imag], [-pole.imag, pole.real]]
+    T = np.linalg.qr(np.random.default_rng(seed).normal(size=(4, 4)))[0]
+    B, C = np.array([[1.0], [0.0], [0.5], [0.2]]), np.array([[1.0, 0.3, 0.8, -0.2]])
+    rest = np.zeros((1, 1)), 1.0, np.zeros(1), np.zeros(1), ("u",), ("y",)
+    return lfrtorch.LinearModel(T @ A @ T.T, T @ B, C @ T.T, *rest).to_model()
+
+
+def test_start_of_a_mean_is_not_fitted_to_few_samples_beyond_what_is_probable():
+    """Sixteen states meet 36 outputs far better than a probable start, and fail after them."""
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=(800, 1))
+    y = arm(0.0, 0).simulate(lfrtorch.Record(u, np.zeros((800, 1)), fs=1.0))
+    several = [arm(d, seed) for seed, d in enumerate((3e-4, -3e-4, 6e-4, -5e-4), start=1)]
+    mean = mean_model(several)
+    for model in (mean, *several):
+        scale_states(model, lfrtorch.Record(u, y, fs=1.0))
+    later, known = y[300:], np.arange(500)[:, None] < 36
+    record = lfrtorch.Record(
+        u[300:], np.where(known, later, 0.0), fs=1.0, start="estimated", skip=36
+    )
+
+    def error(model: Model) -> float:
+        return float(np.sqrt(np.mean((model.simulate(record) - later)[36:] ** 2)))
+
+    assert error(mean) < min(map(error, several))  # of least squares: 3.5 times
 
 
 def test_mean_refuses_models_that_are_not_alike():
