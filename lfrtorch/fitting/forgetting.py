@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from lfrtorch._support.arguments import typed
+from lfrtorch._support.checks import integer
 from lfrtorch._support.tables import percent
 from lfrtorch.data.records import Record, as_records
 from lfrtorch.engine.simulation import simulate
@@ -33,7 +34,7 @@ from lfrtorch.model.model import Model
 LIMIT = 0.02
 """Distance, over the outputs' standard deviation, up to which outputs count as converged."""
 
-_RANDOM = 12  # random start states, beside the record's own and rest
+_SINGULAR = 1e-9  # added to the correlations of the states, which may be exactly dependent
 
 _LONGEST = 10_000  # largest number of samples of a record that are simulated
 
@@ -93,7 +94,11 @@ class Memory(NamedTuple):
 
 @typed("records")
 def forgets(
-    model: Model, records: Record | Sequence[Record], linear: LinearModel | Model | None = None
+    model: Model,
+    records: Record | Sequence[Record],
+    linear: LinearModel | Model | None = None,
+    *,
+    draws: int = 48,
 ) -> Memory:
     """Measure how far a model forgets where it began, on the inputs of its training records.
 
@@ -102,12 +107,17 @@ def forgets(
         records: records that the model was fitted to.
         linear: the linear model of the same records, or the start of the fit: the model may forget
             as slowly. Default: none.
+        draws: number of random start states, beside the record's own and rest.
+
+    Raises:
+        ValueError: no draws.
 
     Example:
         >>> memory = lfrtorch.forgets(model, record, bla)
         >>> memory.right, memory.apart < 1e-3
         (True, True)
     """
+    integer("draws", draws, 1)
     given = sorted(as_records(records), key=lambda record: -record.samples)
     seen, samples = list[Record](), 0
     for record in given:
@@ -116,10 +126,10 @@ def forgets(
             samples += min(record.samples, _LONGEST)
     scale = np.concatenate([record.y for record in given]).std(axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)
-    apart, ends, paths = _apart(model, seen, scale)
+    apart, ends, paths = _apart(model, seen, scale, draws)
     slow = 0.0
     if linear is not None and not apart <= LIMIT:
-        slow, *_ = _apart(linear.to_model(), seen, scale)
+        slow, *_ = _apart(linear.to_model(), seen, scale, draws)
     found = Memory(apart, slow)
     if found.fades or not np.isfinite(apart):
         return found
@@ -127,7 +137,7 @@ def forgets(
 
 
 def _apart(
-    model: Model, records: Sequence[Record], scale: np.ndarray
+    model: Model, records: Sequence[Record], scale: np.ndarray, count: int
 ) -> tuple[float, list[Tensor], list[Tensor]]:
     """Return the largest distance, the ends of trajectories that stay apart, and the own paths."""
     most, ends, paths = 0.0, list[Tensor](), list[Tensor]()
@@ -141,11 +151,15 @@ def _apart(
         if not torch.isfinite(own).all():
             return np.inf, [], []
         moment = (own.mT @ own / len(own)).double()
-        values, axes = torch.linalg.eigh(moment)
-        root = axes * values.clamp_min(0.0).sqrt()
-        # Half of the states are drawn with the states' correlations, half without them.
-        draws = torch.randn(2, _RANDOM // 2, cell.nx, generator=generator, dtype=torch.float64)
-        draws = torch.cat([draws[0] @ root.mT, draws[1] * moment.diagonal().sqrt()])
+        rms = moment.diagonal().sqrt()
+        unit = torch.where(rms > 0.0, rms, 1.0)
+        alike = moment / torch.outer(unit, unit) + _SINGULAR * torch.eye(cell.nx)
+        root = torch.linalg.cholesky(alike)
+        # Every second state is drawn with the states' correlations, the others without them. Draws
+        # do not depend on the scale of the states.
+        draws = torch.randn(count, cell.nx, generator=generator, dtype=torch.float64)
+        draws[::2] = draws[::2] @ root.mT
+        draws = draws * rms
         starts = torch.cat([own[:1], torch.zeros_like(own[:1]), draws.to(own)]).to(cell.A)
         paths.append(own.double())
         for v in (u, u.flip(0)):

@@ -15,6 +15,7 @@ from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
 from lfrtorch.data.records import Record, common_unit
 from lfrtorch.distributed import agreed
 from lfrtorch.fitting.first_fit import cost_in_full
+from lfrtorch.fitting.forgetting import forgets
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.prediction import predicting
 from lfrtorch.fitting.refit import refit
@@ -23,6 +24,7 @@ from lfrtorch.fitting.state_scaling import scale_states
 from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.ridge import Ridge
+from lfrtorch.linear.model import LinearModel
 
 _AVERAGED = 3
 """Largest number of starts in a mean that no held-out record has judged. It is above 1, as the
@@ -41,7 +43,9 @@ class MeanOfGood(Stage):
 
     def run(self, job: Job) -> Job:
         """Leave out poor starts."""
-        return replace(job, result=without_poor_starts(job.result, job.dataset.train))
+        simulated = job.settings.noise == "output" and job.settings.horizon is None
+        linear = job.linear if simulated else None
+        return replace(job, result=without_poor_starts(job.result, job.dataset.train, linear))
 
 
 class Refit(Stage):
@@ -102,9 +106,15 @@ class Refit(Stage):
         return replace(job, again=again)
 
 
-def without_poor_starts(result: FitResult, train: Sequence[Record]) -> FitResult:
-    """The fit whose mean is taken over a few starts with the least training errors."""
-    members = list(result.members[:_AVERAGED])
+def without_poor_starts(
+    result: FitResult, train: Sequence[Record], linear: LinearModel | None = None
+) -> FitResult:
+    """The fit whose mean is taken over a few starts with the least training errors.
+
+    If any starts forget where they began as fast as a linear model does, the others are left out.
+    """
+    forget = [m for m in result.members if linear and forgets(m, train, linear).right]
+    members = (forget or list(result.members))[:_AVERAGED]
     predicts = result.model.K is not None  # the mean of models has no gain of its own
     models, data = predicting(members, train) if predicts else (members, train)
     assert isinstance(models, list)
