@@ -7,12 +7,12 @@ every block.) A ratio is clear if its logarithm is beyond Student's quantile, or
 twice the other: a burst in which one model runs away has a large standard error, but is not chance.
 Differences below 5 % do not count.
 
-In cross-validation the whole record is left out in turn, and each stretch is judged by models that
-were chosen without it. There, 2.25 standard errors and 1 % are enough
-(``benchmarks/first_try.md``). One stretch in which a model runs away may have most of the error,
-but must not decide. So the mean log ratio of the blocks, with each ratio limited to a factor of 3,
-has to point the same way. This mean is enough by itself if it stands for a ratio below 0.85 and is
-2 standard errors below 0.
+In cross-validation the whole record is left out in turn, and each quarter of a stretch is judged by
+models that were fitted without the stretch and chosen without the quarter. There, 2.25 standard
+errors and 0.3 % are enough (``benchmarks/first_try.md``): noise may be most of both errors. One
+stretch in which a model runs away may have most of the error, but must not decide. So the mean log
+ratio of the blocks, with each ratio limited to a factor of 3, has to point the same way. This mean
+is enough by itself if it stands for a ratio below 0.85 and is 2 standard errors below 0.
 
 A part in which inputs and outputs stand still, such as the end of a step test, shows only the
 static gain. It can show that a model is worse, but not that it is better: only parts that move can.
@@ -50,7 +50,7 @@ SAME = 0.05
 """Difference of the errors, relative to the linear model's, below which neither is preferred."""
 
 # SAME in cross-validation, and the standard errors by which a log ratio is clear there.
-_CROSS_SAME, _CROSS_CLEAR = 0.01, 2.25
+_CROSS_SAME, _CROSS_CLEAR = 0.003, 2.25
 _TYPICAL, _TYPICAL_CLEAR = 0.85, 2.0  # mean ratio of the blocks that is enough, standard errors
 _MOST = 3.0  # ratios of blocks are limited to this factor and its inverse
 _CROSS_BLOCKS = 16  # blocks of a record in cross-validation: four in each stretch
