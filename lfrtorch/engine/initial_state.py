@@ -115,9 +115,10 @@ def estimated_start(
     a normal prior adds x0ᵀ P⁻¹ x0 (``state_moments``) to the squared errors over their variance,
     which several passes estimate (``PASSES``). The least squares state is kept in two cases: if it
     is far better over at least 8 outputs for each state, as a system may begin far from the
-    training data; or if the prior makes no difference, as with far more samples than states. A state from which the model diverges is
-    replaced by rest, if the model does not diverge from rest. ``near`` is the initial state of a
-    similar model: the search begins there if its errors are smaller than those from rest.
+    training data; or if the prior makes no difference, as with far more samples than states. A
+    state from which the model diverges is replaced by rest, if the model does not diverge from
+    rest. ``near`` is the initial state of a similar model: the search begins there if its errors
+    are smaller than those from rest.
     """
     W = model.weights()
     nx, factors = W.nx, to_float64(weight)

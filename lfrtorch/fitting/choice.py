@@ -6,21 +6,24 @@ from an estimated state, as on new data. Both errors count alike:
 
 1. The best linear approximations of several orders, each refined without the stretch.
 2. Nonlinear models from small to large: the first few sizes always, and larger ones as long as one
-   of them lowers the error. Each is fitted from two starts along falling ridges, each ridge from
-   where the last one ended, all towards the same start, and simulates by the mean of its starts.
-   A start that does not forget where it began (``lfrtorch.fitting.forgetting``) takes no part.
+   of them lowers the error. Each is fitted from four starts along falling ridges, each ridge from
+   where the last one ended, all towards the same start. Two of them begin at the linear model and
+   two at random states (``lfrtorch.fitting.random_states``), and the better two go on after the
+   first ridges. The mean of the starts simulates what was left out. A start that does not forget
+   where it began (``lfrtorch.fitting.forgetting``) takes no part.
 3. A size takes the largest ridge that does as well as its best one, and the choice takes the
    fewest parameters that do about as well as the best (``lfrtorch.data.paired_blocks``).
 
 The error of a choice is the least of many, and so too small to judge it by. So the choice is made
-again without each of the stretches, and judged on that stretch (nested cross-validation). The
-outputs in ``Choice.left_out``, of both models, are of samples that had no part in their choice.
+again from blocks of the stretches that are drawn with replacement, and judged on the blocks that
+were not drawn (bootstrap of cross-validation). ``Choice.left_out`` has, in each block, the outputs
+of a choice whose error there is nearest to the root mean square of all choices without the block.
 
 References:
     Stone, "Cross-validatory choice and assessment of statistical predictions", Journal of the Royal
     Statistical Society B 36(2), 1974.
-    Varma and Simon, "Bias in error estimation when using cross-validation for model selection", BMC
-    Bioinformatics 7:91, 2006 (nested).
+    Tsamardinos, Greasidou and Borboudakis, "Bootstrapping the out-of-sample predictions for
+    efficient and accurate cross-validation", Machine Learning 107, 2018.
 """
 
 from __future__ import annotations
@@ -70,12 +73,19 @@ Sizes = dict[str, int]
 FOLDS = 4
 """Number of stretches that are left out in turn: each fit has three quarters of the data."""
 
+_DRAWS = 12  # random start states that a candidate must forget
+
+_CHOICES = 30  # choices without a block, at least
+
 _BLOCKS = 4  # blocks of each stretch: two models are compared by 16 differences of squared errors
 
 _RIDGES = ((10.0, 12), (1.0, 12), (0.1, 10), (1e-2, 10), (1e-3, 10), (1e-4, 10), (1e-6, 10))
 """Ridges and the iterations of each."""
 
-_STARTS = 2
+_STARTS = 4  # two of the linear model's states, and two of random ones
+
+_HALVED = 2
+"""Ridges after which the half of a stretch's starts that fit worse is dropped."""
 
 _NEAR = 1.2
 """Largest ratio of a start's rms training error to the least one, for starts in a mean."""
@@ -234,7 +244,7 @@ def choose_sizes(
         given: sizes that are known.
         ridge: ridge of all fits. Default: it is chosen, too.
         last: name of the last size, nn or degree; nw if the map has no other.
-        seed: seed of the first start; the second has seed + 1000.
+        seed: seed of the first start; the others have seed + 1000, ...
         guarantee: guarantee of the trainer.
         horizon: samples ahead that records with a measured start are fitted and judged by. Default:
             they are simulated from the first output on.
@@ -325,9 +335,9 @@ def choose_sizes(
         )
     counts, base = study.counts, study.best_linear()
     tried = [replace(c, ratio=sqrt(c.squares.sum() / base.total)) for c in tried]
-    chosen = _chosen(tried, range(FOLDS), counts)
-    nested = [_chosen(tried, [j for j in range(FOLDS) if j != k], counts) for k in range(FOLDS)]
-    both = [base.outputs, [each.outputs[k] for k, each in enumerate(nested)]]
+    squares = agreed(torch.tensor(np.array([c.squares.ravel() for c in tried]))).numpy()
+    chosen = _chosen(tried, squares, counts.ravel())
+    both = [base.outputs, _unseen(tried, squares, counts.ravel())]
     seconds = time.perf_counter() - clock
     left_out = study.whole(both)
     return Choice(tuple(tried), chosen, base.nx, counts, left_out, seconds)
@@ -343,7 +353,7 @@ def _no_error(found: Sequence[Candidate]) -> str:
 
 def _budget(rows: int) -> float:
     """Return seconds of one core that a search may take, about; a rule, no measured time."""
-    return 60.0 * sqrt(max(rows, 500) / 500)
+    return 20.0 * (max(rows, 500) / 500) ** 0.6
 
 
 def _first(order: int) -> list[int]:
@@ -361,19 +371,36 @@ def _larger(sizes: Sizes, given: Mapping[str, int], last: str) -> Iterator[Sizes
         yield {**sizes, **{name: size for name, size in change.items() if name not in given}}
 
 
-def _chosen(tried: Sequence[Candidate], of: Sequence[int], counts: Integers) -> Candidate:
-    """Return the fewest parameters that do as well as the best in some folds."""
-    squares = np.array([c.squares[list(of)].ravel() for c in tried])
-    squares = agreed(torch.from_numpy(squares)).numpy()
-    blocks = counts[list(of)].ravel()
+def _chosen(tried: Sequence[Candidate], squares: Array, counts: Integers) -> Candidate:
+    """Return the fewest parameters that do as well as the best in some blocks, (C, blocks)."""
     sizes: dict[tuple[int, ...], list[int]] = {}
     for i, candidate in enumerate(tried):
         sizes.setdefault(tuple(candidate.sizes.values()), []).append(i)
     # Of a size the largest ridge was tried first. Where all diverge, all are as good.
-    best = [own[Judge(squares[own], blocks).first_good()] for own in sizes.values()]
-    good = Judge(squares[best], blocks).as_good(errors=_ERRORS, most=_MOST)
+    best = [own[Judge(squares[own], counts).first_good()] for own in sizes.values()]
+    good = Judge(squares[best], counts).as_good(errors=_ERRORS, most=_MOST)
     near = [tried[i] for i, enough in zip(best, good, strict=True) if enough]
     return min(near, key=lambda c: c.parameters_net)
+
+
+def _unseen(tried: Sequence[Candidate], squares: Array, counts: Integers) -> list[Array]:
+    """Return outputs of each stretch, in each block those of a typical choice without the block."""
+    without = [list[Candidate]() for _ in counts]
+    generator = np.random.default_rng(0)
+    while any(len(found) < _CHOICES for found in without):
+        drawn = generator.integers(len(counts), size=len(counts))
+        choice = _chosen(tried, squares[:, drawn], counts[drawn])
+        for block in {*range(len(counts))} - {*drawn.tolist()}:
+            without[block].append(choice)
+    outputs = []
+    for block, found in enumerate(without):
+        errors = np.sqrt([c.squares.flat[block] for c in found])
+        with np.errstate(invalid="ignore"):  # where all run away
+            far = np.abs(errors - np.sqrt(np.mean(errors**2)))
+        typical = found[int(np.argmin(far))]
+        fold, part = divmod(block, _BLOCKS)
+        outputs.append(np.array_split(typical.outputs[fold], _BLOCKS)[part])
+    return [np.concatenate(outputs[k * _BLOCKS : (k + 1) * _BLOCKS]) for k in range(FOLDS)]
 
 
 class _Linear(NamedTuple):
@@ -468,7 +495,7 @@ class _Study:
         static = {name: size for name, size in sizes.items() if name != "nx"}
         linear = self._linear[sizes["nx"]]
         assert linear is not None
-        paths, parameters = list[Iterator[_Step]](), 0
+        paths, parameters = [list[Iterator[_Step]]() for _ in range(FOLDS)], 0
         for k, own in product(range(FOLDS), (seed + 1000 * i for i in range(_STARTS))):
             try:
                 train = in_windows(self._folds[k].train, self._horizon)
@@ -482,11 +509,13 @@ class _Study:
             parameters = model.net_parameter_count
             if parameters > _DENSEST * self.rows:
                 return []
-            paths.append(self._path(model, linear, k))
-        found, worse = list[Candidate](), 0
-        for ridge, _ in self._ridges:
-            every = self._alone(next, paths)
-            steps = [every[k * _STARTS : (k + 1) * _STARTS] for k in range(FOLDS)]
+            paths[k].append(self._path(model, linear, k))
+        found, worse, steps = list[Candidate](), 0, list[list[_Step]]()
+        for number, (ridge, _) in enumerate(self._ridges):
+            if number == _HALVED:
+                paths = [_better_half(*both) for both in zip(paths, steps, strict=True)]
+            every = self._alone(next, [path for own in paths for path in own])
+            steps = [every[k * len(own) : (k + 1) * len(own)] for k, own in enumerate(paths)]
             outputs, fresh = zip(*map(_mean, steps), strict=True)
             squares = self._squares(outputs, fresh)
             remember = any(all(step.remembers for step in own) for own in steps)
@@ -499,9 +528,10 @@ class _Study:
         return found
 
     def work(self, parameters: int) -> float:
-        """Return the seconds that a size takes one core, about."""
-        iterations = FOLDS * _STARTS * sum(count for _, count in _RIDGES)
-        return iterations * (5e-3 + 20e-9 * self.rows * parameters)
+        """Return the seconds that all ridges of a size take one core, about."""
+        first, later = (sum(n for _, n in part) for part in (_RIDGES[:_HALVED], _RIDGES[_HALVED:]))
+        iterations = FOLDS * _STARTS * (first + later / 2)
+        return iterations * (3e-3 + 20e-9 * self.rows * parameters * (1.0 + parameters / 100))
 
     def whole(self, outputs: Sequence[Sequence[Array]]) -> list[tuple[Record, Array, Array]]:
         """Put what was left out of each fold together again: record, linear and NL-LFR output."""
@@ -561,7 +591,9 @@ class _Study:
                 both = self._ahead(model, fold)
             else:
                 stable = largest_stable_amplitude(model, train) >= max(LOUDER)
-                remembers = stable and not forgets(model, train, linear.models[k]).right
+                remembers = (
+                    stable and not forgets(model, train, linear.models[k], draws=_DRAWS).right
+                )
                 through = [simulated(record) for record in self._records]
                 both = fold.left_out(through), fold.begun_again(through, simulated)
             cost = state.cost if stable and not remembers else np.inf
@@ -620,6 +652,12 @@ def _refined(model: LinearModel, fold: Fold) -> LinearModel:
     if begins_at_outputs(fold.train):
         return measured_states_model(fold.train)
     return refined_near(model, fold.train)
+
+
+def _better_half(paths: list[Iterator[_Step]], steps: list[_Step]) -> list[Iterator[_Step]]:
+    """Keep the half with the smaller costs, in their order."""
+    best = sorted(range(len(paths)), key=lambda i: steps[i].cost)[: max(1, len(paths) // 2)]
+    return [paths[i] for i in sorted(best)]
 
 
 def _mean(steps: Sequence[_Step]) -> tuple[Array, Array]:

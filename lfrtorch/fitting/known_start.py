@@ -162,7 +162,7 @@ def with_learned(model: Model, records: Sequence[Record], settings: Settings, se
             rms = torch.where(torch.isfinite(rms), rms, 1.0)
             cell.Cz[own_z] /= rms[:, None]
             cell.Dzu[own_z] /= rms[:, None]
-            if settings.init == "zero_output":
+            if settings.init != "paper":
                 uniform("Bw", (slice(None), own_w), _REACH)
                 uniform("Dyw", (slice(None), own_w), _REACH)
                 learned.zero_output()

@@ -374,12 +374,13 @@ def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]
     return planned
 
 
-def cheap_starts(rows: int, parameters: int, limit: int) -> int:
-    """Number of starts, at most 8, that take about a minute on one core."""
+def cheap_starts(rows: int, parameters: int, limit: int, most: int = 8) -> int:
+    """Number of starts that take about a minute on one core."""
     # An iteration takes 20 ns for each pair of a row and a parameter (Bouc-Wen: 8192 samples, 89
     # parameters, 14 ms). If seconds were measured, the number would depend on the machine.
     work = 20e-9 * rows * parameters
-    cheap = (n for n in (8, 4, 2) if work * iterations_of(schedule(n, limit)) <= _MINUTE)
+    counts = (most >> halvings for halvings in range(most.bit_length() - 1))
+    cheap = (n for n in counts if work * iterations_of(schedule(n, limit)) <= _MINUTE)
     return next(cheap, 1)
 
 

@@ -40,8 +40,10 @@ class PlainSettings:
         'function of neurons: ``"tanh"``, ``"sigmoid"``, ``"relu"``, ``"rbf"``, ``"softplus"``.',
     )
     degree: Size = setting(3, 'degree of the polynomial, or ``"auto"``.', least=1, word="auto")
-    init: Literal["zero_output", "paper"] = setting(
-        "zero_output", "method that makes the starts, see :func:`lfrtorch.initialise`."
+    init: Literal["auto", "zero_output", "random_states", "paper"] = setting(
+        "auto",
+        'method that makes the starts, see :func:`lfrtorch.initialise`. ``"auto"``: '
+        '``"zero_output"``, and ``"random_states"`` for every second start if it applies.',
     )
     relaxations: int = setting(
         0,

@@ -13,7 +13,8 @@ from lfrtorch.data.records import Record
 from lfrtorch.fitting.multistart import cheap_starts
 from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.fitting.prediction import without_innovations
-from lfrtorch.fitting.settings import Settings
+from lfrtorch.fitting.random_states import unsuited, with_random_states
+from lfrtorch.fitting.settings import SEED_STEP, Settings
 from lfrtorch.fitting.stage import Job, Stage
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.windows import in_windows
@@ -22,6 +23,10 @@ from lfrtorch.model.model import Model, check_channels
 
 STARTS_OF_CHOSEN = 4
 """Smallest number of starts for a model of chosen sizes; all of them go to the end."""
+
+_MOST_OF_CHOSEN = 16
+"""Number of starts for a model of chosen sizes, if they take less than a minute. On some records
+only about half of them forget where they began."""
 
 
 class FromModel(Stage):
@@ -62,7 +67,8 @@ class FromLinear(Stage):
         count = settings.starts
         if count == "auto":
             rows = sum(record.y.size for record in train)
-            count = cheap_starts(rows, first.parameter_count, settings.trainer.limit)
+            most = 8 if job.choice is None else _MOST_OF_CHOSEN
+            count = cheap_starts(rows, first.parameter_count, settings.trainer.limit, most)
         if job.choice is not None:
             count = max(STARTS_OF_CHOSEN, count)
             settings = replace(settings, average=count if settings.average > 1 else 1)
@@ -74,13 +80,18 @@ class FromLinear(Stage):
 def starting_model(
     train: Sequence[Record], settings: Settings, linear: LinearModel, seed: int
 ) -> Model:
-    """The model of one start."""
+    """The model of one start; with ``init="auto"`` every second one has random states."""
     names = {one.name for one in fields(PlainSettings)} & {*signature(initialise).parameters}
     options = {name: getattr(settings, name) for name in names}
     with torch.random.fork_rng(devices=[]):  # a caller's module may draw from torch's generator
         torch.manual_seed(seed)
         options |= settings.static_map()
-    model = initialise(linear, train, **options | {"method": settings.init, "seed": seed})
+    method = "zero_output" if settings.init == "auto" else settings.init
+    model = initialise(linear, train, **options | {"method": method, "seed": seed})
+    second = settings.init == "auto" and (seed - settings.seed) // SEED_STEP % 2 == 1
+    proven = settings.trainer.guarantee not in (None, "stable")
+    if second and not (settings.fixed or proven or unsuited(model, train)):
+        model = with_random_states(model, train, seed)
     if settings.noise != "output":
         model = without_innovations(model)
     model.lfr.to(device=settings.device, dtype=settings.dtype)

@@ -21,6 +21,7 @@ from lfrtorch.engine.lfr import LFR
 from lfrtorch.fitting.driven_states import with_driven_states
 from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.nonlinear_end import nonlinear_end
+from lfrtorch.fitting.random_states import unsuited, with_random_states
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.modes import without_slow_minor_modes
@@ -44,7 +45,7 @@ def initialise(
     nn: int | None = None,
     activation: str = "tanh",
     static: Module | None = None,
-    method: Literal["zero_output", "paper"] = "zero_output",
+    method: Literal["zero_output", "random_states", "paper"] = "zero_output",
     seed: int = 0,
     relaxations: int = 0,
     modes: int = 0,
@@ -53,7 +54,7 @@ def initialise(
     structure: str = "free",
     dtype: torch.dtype = torch.float64,
 ) -> Model:
-    """Make an NL-LFR model whose output is that of the linear model.
+    """Make an NL-LFR model whose output is that of the linear model, or near the data.
 
     ``"zero_output"`` first speeds up modes of the linear model that are slower than all others and
     add next to nothing to the output (:func:`lfrtorch.linear.modes.without_slow_minor_modes`). It
@@ -62,13 +63,18 @@ def initialise(
     Signals, states and every z are scaled to unit standard deviation over the records. For z, C*
     and D* are drawn from U(-1, 1), and Cz, Dzu are C*, D* over the standard deviation of
     C* x + D* u. The static map is a ``Network`` with random weights (Wz and bz ~ U(-1, 1), bw = 0),
-    or a module of the caller's own with its given weights. The two methods differ in what makes the
-    contribution of w zero:
+    or a module of the caller's own with its given weights. Two methods begin at the linear model,
+    and differ in what makes the contribution of w zero:
 
     - ``"paper"``: Bw = Dyw = 0 and Ww ~ U(-1, 1) (Schoukens and Tóth 2020);
     - ``"zero_output"``: Ww = 0 and Bw, Dyw ~ U(-0.3, 0.3) (after Schoukens 2021); for a polynomial
       C = 0. This method is more reliable. For a module of another class it applies only if the
       module's output with its given weights is zero on the data; otherwise Bw = Dyw = 0.
+
+    ``"random_states"`` does not begin at the linear model, whose states may be far from those of
+    the system. It draws many Wiener models, with modes of the linear model or random ones and a
+    random network, fits their outputs by least squares, and keeps the best
+    (:mod:`lfrtorch.fitting.random_states`).
 
     If a static map of the linear model's output explains most of the model's error, as in a Wiener
     system, ``"zero_output"`` begins there: the first z are the linear model's outputs, and Bw = 0.
@@ -103,7 +109,7 @@ def initialise(
         nn, activation: number of neurons of the network, and their function.
         static: the map z -> w in place of the network, which is copied: a ``Network``, a
             ``Polynomial`` or any module from (..., nz) to (..., nw); nn and activation are ignored.
-        method: the method that makes the contribution of w zero.
+        method: ``"zero_output"``, ``"random_states"`` or ``"paper"``.
         seed: seed of the random weights.
         relaxations, modes: numbers of relaxations (one state each) and modes (two states each) that
             are added to the linear model.
@@ -118,7 +124,9 @@ def initialise(
         ValueError: sizes below 1, or so large that a fit needs more memory than there is; a dtype
             that is not float32 or float64; an unknown method; a static map of other sizes; modes,
             but no errors above the band of the inputs; no state or input that z may see;
-            ``feedthrough=False`` and a linear model with D; or a linear model that runs away.
+            ``feedthrough=False`` and a linear model with D; a linear model that runs away; or
+            ``"random_states"`` with a static map that is no network, a structure, integrators, a
+            noise model, or a record with a given or measured start.
 
     References:
         Schoukens and Tóth, IFAC-PapersOnLine 53(2), 2020, section 4.2.
@@ -223,9 +231,9 @@ def initialise(
         spread = _deviation(z)[:, None]
         cell.Cz.div_(spread)
         cell.Dzu.div_(spread)
-        if method == "zero_output":
+        if method != "paper":
             cell.map.zero_output()
-        if method == "zero_output" and not static((z / spread.mT).unsqueeze(0)).any():
+        if method != "paper" and not static((z / spread.mT).unsqueeze(0)).any():
             to_output = feedthrough or not z_feedthrough
             uniform(cell.Bw, 0.0 if end == "output" and to_output else _OUTPUT_RANGE)
             uniform(cell.Dyw, _OUTPUT_RANGE if to_output else 0.0)
@@ -240,7 +248,11 @@ def initialise(
         held.no_feedthrough(cell, z=z_feedthrough, y=feedthrough),
     ):
         cell.hold(given)
-    return model
+    if method != "random_states":
+        return model
+    if reason := unsuited(model, data):
+        raise InputError(f"method is 'random_states', but {reason}; give 'zero_output'.")
+    return with_random_states(model, data, int(seed))
 
 
 @torch.no_grad()

@@ -700,7 +700,7 @@ def test_user_errors_are_one_message(
         (["nz=many"], "nz is 'many'; give a whole number of at least 1, or auto"),
         (["degree=auto"], "degree is auto, but this static map has no degree; give nn='auto'"),
         (["nn=auto", "static=polynomial"], "nn is auto, but this static map has no nn"),
-        (["init=magic"], "init is 'magic'; give 'zero_output' or 'paper'"),
+        (["init=magic"], "init is 'magic'; give 'auto', 'zero_output', 'random_states' or 'paper'"),
         (["activation=softsign"], "activation is 'softsign'"),
         (["trainer.damping=-1"], "damping is -1"),
         (["bla.refine=output"], "refine is 'output'"),

@@ -200,7 +200,7 @@ def test_a_stop_later_keeps_the_best_sizes_so_far():
 
 @pytest.mark.usefixtures("short_paths")
 def test_sizes_that_do_not_forget_where_they_began_are_refused(monkeypatch):
-    def memory(model: Model, *_: Any) -> lfrtorch.Memory:
+    def memory(model: Model, *_: Any, **__: Any) -> lfrtorch.Memory:
         return lfrtorch.Memory(1.0 if model.sizes["nn"] == 8 else 0.0)
 
     monkeypatch.setattr(procedure, "forgets", memory)
@@ -215,7 +215,7 @@ def test_sizes_that_do_not_forget_where_they_began_are_refused(monkeypatch):
 
 @pytest.mark.usefixtures("short_paths")
 def test_where_all_sizes_run_away_the_smallest_is_chosen_and_has_no_error(monkeypatch):
-    monkeypatch.setattr(procedure, "forgets", lambda *_: lfrtorch.Memory(np.inf))
+    monkeypatch.setattr(procedure, "forgets", lambda *_, **__: lfrtorch.Memory(np.inf))
     said = list[str]()
     found = chosen(measured(2.0), watch=said.append)
     assert any("note: all sizes run away" in text and "has radius 0." in text for text in said)
@@ -232,7 +232,8 @@ def test_table_has_a_line_for_each_size_and_marks_the_chosen(saturating: Choice)
     assert sum(entry["chosen"] for entry in entries) == 1
 
 
-def test_all_processes_take_the_choice_of_the_first(saturating: Choice):
+@pytest.mark.usefixtures("short_paths")
+def test_all_processes_take_the_choice_of_the_first():
     class Other(lfrtorch.distributed.Ranks):
         """A process that is told the numbers of the first."""
 
@@ -242,5 +243,5 @@ def test_all_processes_take_the_choice_of_the_first(saturating: Choice):
             return squares
 
     with using(Other()):
-        best = procedure._chosen(saturating.candidates, [0, 1], saturating.counts)
-    assert best is saturating.candidates[-1]
+        found = chosen(measured(2.0))
+    assert found.chosen is found.candidates[-1]

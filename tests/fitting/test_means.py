@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -134,7 +135,7 @@ def arm(detuned: float, seed: int) -> Model:
         A[2 * i :][:2, 2 * i :][:, :2] = [[pole.real, pole.imag], [-pole.imag, pole.real]]
     T = np.linalg.qr(np.random.default_rng(seed).normal(size=(4, 4)))[0]
     B, C = np.array([[1.0], [0.0], [0.5], [0.2]]), np.array([[1.0, 0.3, 0.8, -0.2]])
-    rest = np.zeros((1, 1)), 1.0, np.zeros(1), np.zeros(1), ("u",), ("y",)
+    rest: Any = np.zeros((1, 1)), 1.0, np.zeros(1), np.zeros(1), ("u",), ("y",)
     return lfrtorch.LinearModel(T @ A @ T.T, T @ B, C @ T.T, *rest).to_model()
 
 

@@ -164,7 +164,10 @@ def test_options_reach_the_model(bla: LinearModel):
     [
         *(({size: 0}, f"{size} is 0; give a whole number of at le") for size in ("nz", "nw", "nn")),
         ({"nn": None}, "nn is None; give a whole number of at least 1"),  # and no map
-        ({"method": "random"}, "method is 'random'; give 'zero_output' or 'paper'"),
+        (
+            {"method": "random"},
+            "method is 'random'; give 'zero_output', 'random_states' or 'paper'",
+        ),
         *(
             ({"dtype": dtype}, "dtype is .*; give torch.float64 or torch.float32")
             for dtype in (torch.int64, torch.float16, "float64")
