@@ -34,6 +34,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from math import isfinite, nan, sqrt
+from operator import mul
 from threading import Event
 from typing import Any, NamedTuple
 
@@ -82,10 +83,11 @@ _BLOCKS = 4  # blocks of each stretch: two models are compared by 16 differences
 _RIDGES = ((10.0, 12), (1.0, 12), (0.1, 10), (1e-2, 10), (1e-3, 10), (1e-4, 10), (1e-6, 10))
 """Ridges and the iterations of each."""
 
-_STARTS = 4  # two of the linear model's states, and two of random ones
+_STARTS = 8  # four of the linear model's states, and four of random ones
 
 _HALVED = 2
-"""Ridges after which the half of a stretch's starts that fit worse is dropped."""
+"""Number of ridges after each of which the starts of a stretch that fit worse are dropped: half of
+each kind, and half of the others."""
 
 _NEAR = 1.2
 """Largest ratio of a start's rms training error to the least one, for starts in a mean."""
@@ -512,8 +514,9 @@ class _Study:
             paths[k].append(self._path(model, linear, k))
         found, worse, steps = list[Candidate](), 0, list[list[_Step]]()
         for number, (ridge, _) in enumerate(self._ridges):
-            if number == _HALVED:
-                paths = [_better_half(*both) for both in zip(paths, steps, strict=True)]
+            if 0 < number <= _HALVED:
+                kinds = 2 if number == 1 else 1
+                paths = [_better(*both, kinds) for both in zip(paths, steps, strict=True)]
             every = self._alone(next, [path for own in paths for path in own])
             steps = [every[k * len(own) : (k + 1) * len(own)] for k, own in enumerate(paths)]
             outputs, fresh = zip(*map(_mean, steps), strict=True)
@@ -529,8 +532,9 @@ class _Study:
 
     def work(self, parameters: int) -> float:
         """Return the seconds that all ridges of a size take one core, about."""
-        first, later = (sum(n for _, n in part) for part in (_RIDGES[:_HALVED], _RIDGES[_HALVED:]))
-        iterations = FOLDS * _STARTS * (first + later / 2)
+        each = [count for _, count in self._ridges]
+        starts = [_STARTS >> min(number, _HALVED) for number in range(len(each))]
+        iterations = FOLDS * sum(map(mul, each, starts))
         return iterations * (3e-3 + 20e-9 * self.rows * parameters * (1.0 + parameters / 100))
 
     def whole(self, outputs: Sequence[Sequence[Array]]) -> list[tuple[Record, Array, Array]]:
@@ -654,10 +658,13 @@ def _refined(model: LinearModel, fold: Fold) -> LinearModel:
     return refined_near(model, fold.train)
 
 
-def _better_half(paths: list[Iterator[_Step]], steps: list[_Step]) -> list[Iterator[_Step]]:
-    """Keep the half with the smaller costs, in their order."""
-    best = sorted(range(len(paths)), key=lambda i: steps[i].cost)[: max(1, len(paths) // 2)]
-    return [paths[i] for i in sorted(best)]
+def _better(paths: list[Iterator[_Step]], steps: list[_Step], kinds: int) -> list[Iterator[_Step]]:
+    """Keep the half of each kind with the smaller costs, in their order; kinds take turns."""
+    kept = list[int]()
+    for kind in range(kinds):
+        own = sorted(range(kind, len(paths), kinds), key=lambda i: steps[i].cost)
+        kept += own[: max(1, len(own) // 2)]
+    return [paths[i] for i in sorted(kept)]
 
 
 def _mean(steps: Sequence[_Step]) -> tuple[Array, Array]:
