@@ -6,11 +6,11 @@ from an estimated state, as on new data. Both errors count alike:
 
 1. The best linear approximations of several orders, each refined without the stretch.
 2. Nonlinear models from small to large: the first few sizes always, and larger ones as long as one
-   of them lowers the error. Each is fitted from four starts along falling ridges, each ridge from
-   where the last one ended, all towards the same start. Two of them begin at the linear model and
-   two at random states (``lfrtorch.fitting.random_states``), and the better two go on after the
-   first ridges. The mean of the starts simulates what was left out. A start that does not forget
-   where it began (``lfrtorch.fitting.forgetting``) takes no part.
+   of them lowers the error. Each is fitted from eight starts along falling ridges, each ridge from
+   where the last one ended, all towards the same start. Four of them begin at the linear model and
+   four at random states (``lfrtorch.fitting.random_states``). After each of the first two ridges
+   the better half goes on. The mean of the starts simulates what was left out. A start that does
+   not forget where it began (``lfrtorch.fitting.forgetting``) takes no part.
 3. A size takes the largest ridge that does as well as its best one, and the choice takes the
    fewest parameters that do about as well as the best (``lfrtorch.data.paired_blocks``).
 
