@@ -74,7 +74,7 @@ def initialise(
     ``"random_states"`` does not begin at the linear model, whose states may be far from those of
     the system. It draws many Wiener models, with modes of the linear model or random ones and a
     random network, fits their outputs by least squares, and keeps the best
-    (:mod:`lfrtorch.fitting.random_states`).
+    (``lfrtorch.fitting.random_states``).
 
     If a static map of the linear model's output explains most of the model's error, as in a Wiener
     system, ``"zero_output"`` begins there: the first z are the linear model's outputs, and Bw = 0.
