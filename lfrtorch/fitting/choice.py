@@ -355,7 +355,7 @@ def _no_error(found: Sequence[Candidate]) -> str:
 
 def _budget(rows: int) -> float:
     """Return seconds of one core that a search may take, about; a rule, no measured time."""
-    return 20.0 * (max(rows, 500) / 500) ** 0.6
+    return min(180.0, 20.0 * (max(rows, 500) / 500) ** 0.75)
 
 
 def _first(order: int) -> list[int]:
