@@ -29,7 +29,7 @@ _DRAWS = 4, 256
 draws always leads to the same poor minimum."""
 
 _SAMPLES = 5000
-"""Largest number of samples that the draws are compared on."""
+"""Largest number of scored samples that the draws are compared on."""
 
 _OF_LINEAR = 0.5
 """Part of the modes that are those of the linear model."""
@@ -108,11 +108,11 @@ def _written(model: Model, found: dict[str, Array], rng: np.random.Generator) ->
     static = Network(old.nz, old.nw, len(found["bz"]), old.static.activation, dtype=old.A.dtype)
     sizes = old.nu, old.ny, old.nx, old.nz, old.nw
     cell = LFRCell(*sizes, static, dtype=old.A.dtype, random=False)
-    own, share = min(old.ny, old.nw), np.zeros((old.ny, old.nw))
     # With fewer w than outputs, the maps of the outputs are nearest to multiples of a few.
     left, size, right = np.linalg.svd(
         np.column_stack([found["Ww"], found["bw"]]), full_matrices=False
     )
+    own, share = min(len(size), old.nw), np.zeros((old.ny, old.nw))
     share[:, :own] = left[:, :own]
     share[:, own:] = rng.uniform(-0.3, 0.3, (old.ny, old.nw - own))
     maps = np.zeros((old.nw, right.shape[1]))
@@ -127,22 +127,23 @@ def _written(model: Model, found: dict[str, Array], rng: np.random.Generator) ->
 
 
 def _signals(model: Model, records: Sequence[Record]) -> tuple[list[Array], list[Array], Booleans]:
-    """Normalised inputs and outputs of the beginnings of records, and which samples count."""
+    """Normalised inputs and outputs of the beginnings of records, and which outputs count."""
     total = sum(record.samples for record in records)
     inputs, outputs, scored = list[Array](), list[Array](), list[Booleans]()
     for record in records:
-        T = max(1, record.samples * min(_SAMPLES, total) // total)
-        u = model.scaler.normalise_u(record.u)
-        y, own = model.scaler.normalise_y(record.y[:T]), record.factors[:T] > 0
+        u, y = model.scaler.normalise_u(record.u), model.scaler.normalise_y(record.y)
+        own = record.factors > 0
+        if record.start == "estimated":
+            own[: min(record.samples // 8, _UNKNOWN)] = False
+        most = max(1, record.samples * min(_SAMPLES, total) // total)
+        # What is masked before is simulated, too.
+        T = 1 + max(int(np.flatnonzero(each)[:most].max(initial=0)) for each in own.T)
+        own, y = own[:T], np.where(own, y, 0.0)[:T]
         if record.start == "periodic":
-            before = min(T, record.samples)
-            u = np.vstack([u[-before:], u])[: before + T]
-            y = np.vstack([np.zeros((before, y.shape[1])), y])
-            own = np.vstack([np.zeros((before, y.shape[1]), np.bool_), own])
-        elif record.start != "zero":
-            own[: min(T // 8, _UNKNOWN)] = False
+            u = np.vstack([u[-T:], u])
+            own, y = (np.vstack([np.zeros_like(each), each]) for each in (own, y))
         inputs.append(u[: len(y)])
-        outputs.append(np.where(own, y, 0.0))
+        outputs.append(y)
         scored.append(own)
     return inputs, outputs, np.concatenate(scored)
 
@@ -196,6 +197,9 @@ def _least_squares(columns: Array, y: Array, scored: Booleans) -> tuple[Array, f
     found, total = [], 0.0
     for own, target in zip(scored.T, y.T, strict=True):
         F, t = columns[own], target[own]
+        if not len(F):
+            found.append(np.zeros(F.shape[1]))
+            continue
         gram = F.T @ F + _RIDGE * len(F) * np.eye(F.shape[1])
         found.append(scipy.linalg.solve(gram, F.T @ t, assume_a="pos"))
         total += float(np.mean((t - F @ found[-1]) ** 2))

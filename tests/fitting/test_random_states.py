@@ -92,6 +92,29 @@ def test_several_outputs_share_the_maps_that_there_are(nw: int):
     assert errors[0] < (1.2 if nw == 1 else 1.0) * errors[1]
 
 
+def test_there_may_be_fewer_neurons_than_outputs():
+    one = hidden()
+    record = Record(one.u, np.hstack([one.y, 2.0 * one.y + one.u, one.u]), 1.0)
+    sizes: dict[str, Any] = {"nz": 1, "nw": 3, "nn": 1}
+    bla = estimate_bla(record, nx=3)
+    model = initialise(bla, record, **sizes, method="random_states")
+    assert lfrtorch.rmse(record, model.simulate(record)) < float(record.y.std())
+
+
+def test_a_beginning_without_measurements_is_passed_over():
+    """A long record is compared on its first scored samples, wherever they are."""
+    whole = hidden(24_000)
+    valid = np.ones((24_000, 2), dtype=bool)
+    valid[:8000, 0] = False
+    y = np.hstack([whole.y, whole.y])
+    some = Record(whole.u, y, 1.0, "estimated", valid=valid)
+    bla = estimate_bla(Record(whole.u, y, 1.0), nx=3)
+    model = initialise(bla, some, nz=1, nw=2, nn=8, method="random_states")
+    errors = model.simulate(some) - y
+    assert np.isfinite(errors).all()
+    assert (errors[12_000:].std(axis=0) < y.std()).all()
+
+
 def test_no_feedthrough_stays_none():
     record = hidden()
     bla = estimate_bla(record, nx=3, feedthrough=False)
