@@ -141,7 +141,7 @@ def _signals(model: Model, records: Sequence[Record]) -> tuple[list[Array], list
         own, y = own[:T], np.where(own, y, 0.0)[:T]
         if record.start == "periodic":
             u = np.vstack([u[-T:], u])
-            own, y = (np.vstack([np.zeros_like(each), each]) for each in (own, y))
+            own, y = np.vstack([np.zeros_like(own), own]), np.vstack([np.zeros_like(y), y])
         inputs.append(u[: len(y)])
         outputs.append(y)
         scored.append(own)
