@@ -375,7 +375,7 @@ def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]
 
 
 def cheap_starts(rows: int, parameters: int, limit: int, most: int = 8) -> int:
-    """Number of starts that take about a minute on one core."""
+    """Number of starts, ``most`` or a half, a quarter, ..., that take a minute on one core."""
     # An iteration takes 20 ns for each pair of a row and a parameter (Bouc-Wen: 8192 samples, 89
     # parameters, 14 ms). If seconds were measured, the number would depend on the machine.
     work = 20e-9 * rows * parameters

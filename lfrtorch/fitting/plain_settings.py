@@ -111,8 +111,8 @@ class PlainSettings:
     starts: Size = setting(
         "auto",
         "number of random starts, of which the best is kept; at least 4 if sizes are chosen. "
-        '``"auto"``: 8, or fewer if 8 would take more than about a minute on one core. A single '
-        "start may end in a poor minimum.",
+        '``"auto"``: 8, or 16 if sizes are chosen, or fewer if these would take more than about a '
+        "minute on one core. A single start may end in a poor minimum.",
         least=1,
         word="auto",
     )
