@@ -643,6 +643,16 @@ def test_periods_after_the_transient_are_fitted_in_steady_state():
     np.testing.assert_allclose(found.poles, expected.poles, rtol=1e-9)
 
 
+def test_rounded_periods_of_fewer_records_than_inputs_are_fitted():
+    """Files round: two periods of two inputs differ, and one record has no two experiments."""
+    rng, system = np.random.default_rng(0), random_system(2, 2, seed=2)
+    u = np.tile(rng.normal(size=(256, 2)), (3, 1))
+    y = reference.dlsim(system, u)[256:]
+    u = u[256:] + 1e-7 * rng.normal(size=(512, 2))
+    model = estimate_bla(Record(u, y, 10.0, "periodic", period=256), 2)
+    assert frf_error(model, system) < 1e-4
+
+
 def test_drift_is_no_steady_state():
     assert steady_state([settling_records()[0]]) is not None
     assert steady_state([settling_records(drift=30.0)[0]]) is None
