@@ -4,7 +4,8 @@ Four stretches of the estimation records are left out in turn (``lfrtorch.fittin
 and nonlinear models are fitted to the rest, simulated through what was left out, and begun in it
 from an estimated state, as on new data. Both errors count alike:
 
-1. The best linear approximations of several orders, each refined without the stretch.
+1. The best linear approximations of several orders, each refined without the stretch. A pole slower
+   than the longest record counts against an order.
 2. Nonlinear models from small to large: the first few sizes always, and larger ones as long as one
    of them lowers the error. Each is fitted from eight starts along falling ridges, each ridge from
    where the last one ended, all towards the same start. Four of them begin at the linear model and
@@ -107,6 +108,11 @@ errors is partly small by chance."""
 
 _MOST = 1.3
 """Largest ratio of rms errors up to which a size counts as good as the best."""
+
+_UNTOLD = 1.2
+"""Ratio of rms errors by which a linear model has to be better if one of its poles, also without a
+stretch, is slower than the longest record. Such a pole follows what passes in this record. In a
+longer one it drifts."""
 
 _GAIN = 0.98  # larger sizes are tried as long as the least error falls by more than to this part
 
@@ -412,6 +418,7 @@ class _Linear(NamedTuple):
     models: list[LinearModel]
     outputs: list[Array]
     squares: Array
+    untold: bool  # a pole is slower than the longest record
 
     @property
     def total(self) -> float:
@@ -470,7 +477,10 @@ class _Study:
             outputs, fresh = ([each[i] for each in both] for i in range(2))
             squares = self._squares(outputs, fresh)
             if np.isfinite(squares).all():
-                self._linear[nx] = _Linear(nx, models, outputs, squares)
+                longest = max(record.samples for record in self._records)
+                slowest = max(np.abs(each.poles).max(initial=0.0) for each in (model, *models))
+                untold = bool(slowest > np.exp(-1.0 / longest))
+                self._linear[nx] = _Linear(nx, models, outputs, squares, untold)
         return self._linear[nx] is not None
 
     def best_linear(self, orders: Sequence[int] = ()) -> _Linear:
@@ -483,6 +493,13 @@ class _Study:
                 "no linear model of these records is stable without a quarter of them; give longer "
                 "records, or set the sizes."
             )
+        best = self._first_good(found)
+        if best.untold and (told := [each for each in found if not each.untold]):
+            other = self._first_good(told)
+            best = other if other.total <= _UNTOLD**2 * best.total else best
+        return best
+
+    def _first_good(self, found: Sequence[_Linear]) -> _Linear:
         squares = np.array([each.squares.ravel() for each in found])
         return found[Judge(squares, self.counts.ravel()).first_good()]
 

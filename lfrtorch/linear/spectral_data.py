@@ -219,7 +219,7 @@ def _together(group: Sequence[_Lines]) -> tuple[Complex, Complex]:
         shown, power = (np.trace(S, axis1=1, axis2=2).real for S in (noise[:, :nu, :nu], U @ Uh))
         # A line of noise alone has ten times its mean power once in 1e4.
         excited = power > 10.0 * smoothed(shown[:, None], NOISE_LINES)[:, 0]
-    if R < nu:  # noise leaves nothing of fewer experiments than inputs: it is not subtracted
+    if nu > R:  # noise leaves nothing of fewer experiments than inputs: it is not subtracted
         return _compressed(U * excited[:, None, None], Y * excited[:, None, None])
     counts = (excited & clear)[:, None, None]
     root = np.asarray(np.linalg.cholesky(left) * counts, dtype=np.complex128)

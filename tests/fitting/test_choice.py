@@ -118,6 +118,19 @@ def test_orders_go_two_beyond_that_of_the_scan(monkeypatch):
 
 
 @pytest.mark.usefixtures("short_paths")
+@pytest.mark.parametrize("seed", [4, 6])
+def test_a_pole_slower_than_the_record_has_to_pay(seed: int):
+    """It follows the drift of this record; of the system it says nothing."""
+    rng = np.random.default_rng(seed)
+    u, y = rng.standard_normal(200), np.zeros(200)
+    for k in range(199):
+        y[k + 1] = 0.6 * y[k] + u[k]
+    record = Record(u, y + 0.06 * np.cumsum(rng.standard_normal(200)))
+    given = {"nx": 1, "nz": 1, "nw": 1, "nn": 1}
+    assert chosen(record, orders=[1, 2, 3], given=given, ridge=10.0).nx == 1
+
+
+@pytest.mark.usefixtures("short_paths")
 def test_sizes_given_are_kept():
     found = chosen(measured(1.0), given={"nx": 2, "nz": 2, "nw": 1, "nn": 3}, orders=[2])
     assert {tuple(c.sizes.items()) for c in found.candidates} == {
