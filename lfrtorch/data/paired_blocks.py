@@ -13,7 +13,7 @@ Long records resolve differences that are not worth a parameter: on the Silverbo
 better than 5 by 0.6 %, which is two standard errors. So a model within 1 % of the best counts as
 equally good. If a few resonances or impacts make up most of the error, one standard error can be a
 fifth of it, and the smallest model within it leaves out just these. So no model more than 5 % above
-the best counts as equally good by default.
+the best counts as equally good.
 
 References:
     Hastie, Tibshirani and Friedman, "The Elements of Statistical Learning", 2nd ed., 2009, section
@@ -35,6 +35,9 @@ from lfrtorch._support.types import Array, Booleans, Integers
 
 MARGIN = 0.01
 """Relative excess of the rms error up to which a model counts as equally good as the best."""
+
+_MOST = 1.05
+"""Largest ratio of rms errors at which a model counts as equally good as the best."""
 
 BLOCKS = 10
 """Smallest number of blocks of time, over all records."""
@@ -68,15 +71,15 @@ class Judge:
         sums = self.squares.sum(axis=1)
         return np.argsort(np.where(np.isnan(sums), inf, sums), kind="stable").tolist()
 
-    def as_good(self, *, errors: float = 1.0, most: float = 1.05) -> Booleans:
+    def as_good(self) -> Booleans:
         """Mask of the models that are as good as the best.
 
-        Either the rms error is within ``MARGIN`` of the smallest. Or the mean square is within
-        ``errors`` standard errors of the smallest, and the rms error at most ``most`` times it.
+        Either the rms error is within ``MARGIN`` of the smallest. Or the mean square is within one
+        standard error of the smallest, and the rms error at most ``_MOST`` times it.
         """
         means = self.squares.sum(axis=1)
-        near = self.above() <= errors
-        near &= means <= most**2 * means.min()
+        near = self.above() <= 1.0
+        near &= means <= _MOST**2 * means.min()
         return near | (means <= (1.0 + MARGIN) ** 2 * means.min())
 
     def first_good(self) -> int:

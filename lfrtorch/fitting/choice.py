@@ -102,13 +102,6 @@ _DENSEST = 0.5  # largest number of net parameters for each scored output
 
 _WORSE = 1.3  # error over the best so far; two worse ridges in a row end the search
 
-_ERRORS = 2.0
-"""Number of standard errors within which a size counts as good as the best: the least of many
-errors is partly small by chance."""
-
-_MOST = 1.3
-"""Largest ratio of rms errors up to which a size counts as good as the best."""
-
 _UNTOLD = 1.2
 """Ratio of rms errors by which a linear model has to be better if one of its poles, also without a
 stretch, is slower than the longest record. Such a pole follows what passes in this record. In a
@@ -195,7 +188,7 @@ LEGEND = """\
 / linear: rms error where it was left out over the linear model's. It compares sizes: the least of
 many is smaller than on new data.
 above best: in standard errors of the difference.
-chosen: the fewest net parameters with 2 at most and an error up to 30 % above the best."""
+chosen: the fewest net parameters with 1 at most and an error up to 5 % above the best."""
 
 
 def choice_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
@@ -386,7 +379,7 @@ def _chosen(tried: Sequence[Candidate], squares: Array, counts: Integers) -> Can
         sizes.setdefault(tuple(candidate.sizes.values()), []).append(i)
     # Of a size the largest ridge was tried first. Where all diverge, all are as good.
     best = [own[Judge(squares[own], counts).first_good()] for own in sizes.values()]
-    good = Judge(squares[best], counts).as_good(errors=_ERRORS, most=_MOST)
+    good = Judge(squares[best], counts).as_good()
     near = [tried[i] for i, enough in zip(best, good, strict=True) if enough]
     return min(near, key=lambda c: c.parameters_net)
 
