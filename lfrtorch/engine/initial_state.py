@@ -174,6 +174,7 @@ def _staying(
     return torch.where(torch.from_numpy(away).to(x0.device)[:, None], 0.0, x0)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def state_moments(model: Numbers, u: Float[Tensor, "R T nu"]) -> Float[Array, "R nx nx"]:
     """Prior second moment E x xᵀ, about 0, of initial states.
 
@@ -186,9 +187,9 @@ def state_moments(model: Numbers, u: Float[Tensor, "R T nu"]) -> Float[Array, "R
     if not np.array_equal(P, np.eye(W.nx)):
         return np.broadcast_to(P, (len(u), W.nx, W.nx))
     x = to_float64(simulate(W, u, None).x)
-    lost: Booleans = np.asarray(~np.isfinite(x).all(axis=(1, 2)))
-    x = np.where(lost[:, None, None], 0.0, x) if lost.any() else x
-    return x.swapaxes(1, 2) @ x / x.shape[1]
+    moments = x.swapaxes(1, 2) @ x / x.shape[1]
+    kept: Booleans = np.asarray(np.isfinite(moments).all(axis=(1, 2)))  # squares may overflow, too
+    return np.where(kept[:, None, None], moments, 0.0)
 
 
 class _Prior(NamedTuple):

@@ -192,6 +192,14 @@ def test_estimated_initial_state_of_a_diverging_model_is_not_finite():
     assert not simulate_estimated(cell, u, y, torch.ones_like(y)).finite
 
 
+def test_states_whose_squares_overflow_tell_nothing_of_the_initial_state():
+    cell, u = random_cell(1, 1, 2, 0, 0, radius=3.0), normal(1, 600, 1)
+    x = simulate(cell, u, None).x
+    assert torch.isfinite(x).all()
+    assert not torch.isfinite(x.square()).all()
+    assert torch.isfinite(estimated_start(cell, u, torch.zeros_like(u), torch.ones_like(u))).all()
+
+
 def test_no_initial_state_is_taken_from_which_the_model_runs_away_and_not_from_rest():
     """x+ = 1.2 x - 0.5 tanh x + u is unstable beyond |x| = 2.47, where noise puts the state."""
     network = Network(1, 1, 1, dtype=torch.float64)
