@@ -107,6 +107,8 @@ _UNTOLD = 1.2
 stretch, is slower than the longest record. Such a pole follows what passes in this record. In a
 longer one it drifts."""
 
+_REST = 0.05  # part of the budget that begins no size, as its work would be far more
+
 _GAIN = 0.98  # larger sizes are tried as long as the least error falls by more than to this part
 
 
@@ -282,7 +284,7 @@ def choose_sizes(
     def attempt(sizes: Sizes) -> None:
         nonlocal left
         key = tuple(sizes.values())
-        spent = len(begun) >= len(_SMALL) and left <= 0.0
+        spent = len(begun) >= len(_SMALL) and left <= _REST * budget
         if key in begun or spent or not study.has_order(sizes["nx"]):
             return
         begun.add(key)
