@@ -52,7 +52,7 @@ def shapes_are_checked() -> None:
 def short_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two ridges in the place of seven and the small sizes alone, where sizes are chosen."""
     monkeypatch.setattr("lfrtorch.fitting.choice._RIDGES", ((0.1, 3), (1e-3, 3)))
-    monkeypatch.setattr("lfrtorch.fitting.choice._budget", lambda rows: 0.0)
+    monkeypatch.setattr("lfrtorch.fitting.choice._budget", lambda rows: 1e-9)
 
 
 @pytest.fixture

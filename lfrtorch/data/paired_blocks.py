@@ -66,11 +66,6 @@ class Judge:
         counts = np.array([len(block) for block in blocks])
         return cls(np.array([squares_in_blocks(each) for each in errors]), counts)
 
-    def ranked(self) -> list[int]:
-        """Models by rising error; equal ones keep their order."""
-        sums = self.squares.sum(axis=1)
-        return np.argsort(np.where(np.isnan(sums), inf, sums), kind="stable").tolist()
-
     def as_good(self) -> Booleans:
         """Mask of the models that are as good as the best.
 

@@ -37,7 +37,7 @@ from itertools import product
 from math import isfinite, nan, sqrt
 from operator import mul
 from threading import Event
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -215,6 +215,8 @@ def _cell(value: Any) -> Any:
     return str(value) if isinstance(value, Mapping) else value  # ridges by group
 
 
+Made = TypeVar("Made", LinearModel, Model)
+
 Start = Callable[[LinearModel, Sequence[Record], Sizes, int], Model]
 """Makes the model of given sizes that a fit to records starts from, with a seed."""
 
@@ -292,14 +294,9 @@ def choose_sizes(
         found = study.candidates(sizes, start, seed, base.total)
         left -= study.work(found[0].parameters_net if found else 0) * len(found) / len(path)
         tried.extend(found)
-        best = min((c.ratio for c in found), default=nan)
         text = ", ".join(f"{name} {size}" for name, size in sizes.items())
-        error = (
-            f"{percent(best)} of the linear model's error" if isfinite(best) else _no_error(found)
-        )
-        seconds = quantity(time.perf_counter() - since, "s")
-        done = percent(min(1.0, 1.0 - left / budget)) if budget else "all"
-        watch(f"sizes: {text}: {error}, {seconds}, {done} of the search's work")
+        text += f": {_error_of(found)}, {quantity(time.perf_counter() - since, 's')}"
+        watch(f"sizes: {text}, {percent(min(1.0, 1.0 - left / budget))} of the search's work")
 
     def leader() -> Candidate | None:
         finite = [c for c in tried if isfinite(c.ratio)]
@@ -346,12 +343,13 @@ def choose_sizes(
     return Choice(tuple(tried), chosen, base.nx, counts, left_out, seconds)
 
 
-def _no_error(found: Sequence[Candidate]) -> str:
-    """Say why sizes have no error where they are left out."""
+def _error_of(found: Sequence[Candidate]) -> str:
+    """Say the least error of sizes where they are left out, or why they have none."""
+    if isfinite(best := min((c.ratio for c in found), default=nan)):
+        return f"{percent(best)} of the linear model's error"
     if not found:
         return "too many parameters for these records"
-    remember = any(c.remembers for c in found)
-    return "does not forget where it began" if remember else "diverges"
+    return "does not forget where it began" if any(c.remembers for c in found) else "diverges"
 
 
 def _budget(rows: int) -> float:
@@ -461,10 +459,7 @@ class _Study:
         if nx not in self._linear:
             self._linear[nx] = None
             try:
-                model = self._whole(nx)
-                if not isinstance(model, LinearModel):
-                    said = f"linear returned {brief(repr(model))}; it is to return a LinearModel."
-                    raise LfrtorchError(said)
+                model = _made("linear", self._whole(nx), LinearModel)
                 models = self._alone(partial(_refined, model), self._folds)
             except ValueError:
                 return False
@@ -513,13 +508,9 @@ class _Study:
         for k, own in product(range(FOLDS), (seed + 1000 * i for i in range(_STARTS))):
             try:
                 train = in_windows(self._folds[k].train, self._horizon)
-                model = start(linear.models[k], train, static, own)
+                model = _made("start", start(linear.models[k], train, static, own), Model)
             except InputError:
                 return []
-            if not isinstance(model, Model):
-                raise LfrtorchError(
-                    f"start returned {brief(repr(model))}; it is to return a Model."
-                )
             parameters = model.net_parameter_count
             if parameters > _DENSEST * self.rows:
                 return []
@@ -662,6 +653,13 @@ class _Study:
             return each_alone(work, items, self._halt, threads=worth_threads(self.rows))
         except KeyboardInterrupt:
             raise StoppedError("stopped while sizes were chosen") from None
+
+
+def _made(name: str, made: Any, kind: type[Made]) -> Made:
+    if not isinstance(made, kind):
+        said = f"{name} returned {brief(repr(made))}; it is to return a {kind.__name__}."
+        raise LfrtorchError(said)
+    return made
 
 
 def _refined(model: LinearModel, fold: Fold) -> LinearModel:

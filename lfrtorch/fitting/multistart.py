@@ -47,7 +47,6 @@ from lfrtorch._support.reasons import CUT_SHORT, Reason, told
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.analysis.static_slopes import infinite_slope
-from lfrtorch.data.paired_blocks import Judge
 from lfrtorch.data.records import Record, as_records, common_unit
 from lfrtorch.data.score_window import with_window
 from lfrtorch.distributed import Ranks, current, using
@@ -415,8 +414,8 @@ class _Judge:
     def ranked(self, fits: Sequence[Fit]) -> list[Fit]:
         """Sort the fits that have begun, the best first, and those that are refused last."""
         begun = [fit for fit in fits if fit.history]
-        squares = np.array([self._score(fit) for fit in begun]).reshape(-1, 1)
-        order = Judge(squares, np.ones(1, int)).ranked()
+        scores = np.nan_to_num([self._score(fit) for fit in begun], nan=np.inf, posinf=np.inf)
+        order = np.argsort(scores, kind="stable")
         return sorted((begun[i] for i in order), key=lambda fit: id(fit) in self._refused)
 
     def refuse_what_remembers(

@@ -18,8 +18,6 @@ from torch import Tensor
 
 from lfrtorch._support.errors import InputError
 
-Number = float | bool
-
 
 class Operation(NamedTuple):
     """Row of a table: the name of an operation, and its operands."""

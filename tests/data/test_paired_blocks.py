@@ -141,8 +141,3 @@ def test_the_ratio_of_two_models_does_not_depend_on_the_unit_of_their_errors():
         for _ in range(2000)
     ]
     assert std == pytest.approx(np.std(draws), rel=0.6)  # of ten blocks
-
-
-def test_models_are_ranked_with_equal_ones_in_their_order_and_lost_ones_last():
-    squares = np.array([[3.0], [1.0], [np.nan], [1.0], [np.inf]])
-    assert Judge(squares, np.ones(1, int)).ranked() == [1, 3, 0, 2, 4]
