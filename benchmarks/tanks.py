@@ -1,6 +1,6 @@
 """Cross-validation of the cascaded tanks' settings, on the estimation record alone.
 
-    python benchmarks/tanks.py --root DIR [--starts 6]       # 24: the second table of tanks.md
+    python benchmarks/tanks.py --root DIR [--starts 24]
 
 Each eighth of the estimation record is left out once: the rest trains, without a validation part,
 and the model simulates the record through what was left out. All begin at the linear model of the
@@ -44,7 +44,7 @@ def main() -> int:
     """The table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--root", type=Path, required=True)
-    parser.add_argument("--starts", type=int, default=6)
+    parser.add_argument("--starts", type=int, default=24)
     options = parser.parse_args()
     (measured,) = cascaded_tanks.load(root=options.root, validation=0).train
     heads = ["limit", "neurons", "ridge", "median start"]
