@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lfrtorch import datasets
 
@@ -83,13 +84,30 @@ def run(name: str, script: str, options: argparse.Namespace) -> dict[str, Any]:
     given = record(name, options.root, options.wild)
     u, y = given.pop("u"), given.pop("y")
     cut = 3 * len(u) // 4
+    given |= {"u": u[:cut], "y": y[:cut], "every_u": u, "order": order}
+    found, seconds = simulated(script, given, options.peers)
+    if isinstance(found, str):
+        return {"failed": found}
+    rmse = float(np.sqrt(np.mean((found - y)[cut:] ** 2)))
+    if not np.isfinite(rmse) or rmse > 100.0 * np.std(y):
+        return {"failed": "diverges", "seconds": round(seconds, 1)}
+    return {
+        "rmse": factor * rmse,
+        "nrmse": rmse / float(np.std(y[cut:])),
+        "seconds": round(seconds, 1),
+    }
+
+
+def simulated(
+    script: str, given: dict[str, Any], peers: Path
+) -> tuple[npt.NDArray[np.float64] | str, float]:
+    """What a contestant makes of ``every_u``, or why it did not; and seconds."""
     python = Path(sys.executable)
     if not script.startswith("lfrtorch"):
-        package = script.rpartition("_")[0]
-        python = options.peers.resolve() / package / "bin" / "python"
+        python = peers.resolve() / script.rpartition("_")[0] / "bin" / "python"
     with tempfile.TemporaryDirectory() as folder:
         data, out = Path(folder, "given.npz"), Path(folder, "simulated.npy")
-        np.savez(data, u=u[:cut], y=y[:cut], every_u=u, order=order, **given)
+        np.savez(data, **given)
         begin = time.time()
         environment = os.environ | {"DEADLINE": str(begin + SECONDS), "PYTHONHASHSEED": "0"}
         try:
@@ -103,21 +121,13 @@ def run(name: str, script: str, options: argparse.Namespace) -> dict[str, Any]:
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            return {"failed": "not done in two minutes"}
+            return "not done in two minutes", SECONDS
         seconds = time.time() - begin
         if done.returncode and seconds > SECONDS - GRACE:  # it ended itself in time
-            return {"failed": "not done in two minutes"}
+            return "not done in two minutes", seconds
         if done.returncode or not out.exists():
-            return {"failed": (done.stderr.strip().splitlines() or ["no output"])[-1][:200]}
-        errors = (np.load(out) - y)[cut:]
-    rmse = float(np.sqrt(np.mean(errors**2)))
-    if not np.isfinite(rmse) or rmse > 100.0 * np.std(y):
-        return {"failed": "diverges", "seconds": round(seconds, 1)}
-    return {
-        "rmse": factor * rmse,
-        "nrmse": rmse / float(np.std(y[cut:])),
-        "seconds": round(seconds, 1),
-    }
+            return (done.stderr.strip().splitlines() or ["no output"])[-1][:200], seconds
+        return np.load(out), seconds
 
 
 def about(script: str) -> tuple[str, int]:
