@@ -102,12 +102,12 @@ _DENSEST = 0.5  # largest number of net parameters for each scored output
 
 _WORSE = 1.3  # error over the best so far; two worse ridges in a row end the search
 
-_UNTOLD = 1.2
+_SLOW = 1.2
 """Ratio of rms errors by which a linear model has to be better if one of its poles, also without a
 stretch, is slower than the longest record. Such a pole follows what passes in this record. In a
 longer one it drifts."""
 
-_REST = 0.05  # part of the budget that begins no size, as its work would be far more
+_REST = 0.05  # part of the budget with which no size is begun: its work is far more
 
 _GAIN = 0.98  # larger sizes are tried as long as the least error falls by more than to this part
 
@@ -411,7 +411,7 @@ class _Linear(NamedTuple):
     models: list[LinearModel]
     outputs: list[Array]
     squares: Array
-    untold: bool  # a pole is slower than the longest record
+    slow: bool  # a pole is slower than the longest record
 
     @property
     def total(self) -> float:
@@ -469,8 +469,8 @@ class _Study:
             if np.isfinite(squares).all():
                 longest = max(record.samples for record in self._records)
                 slowest = max(np.abs(each.poles).max(initial=0.0) for each in (model, *models))
-                untold = bool(slowest > np.exp(-1.0 / longest))
-                self._linear[nx] = _Linear(nx, models, outputs, squares, untold)
+                slow = bool(slowest > np.exp(-1.0 / longest))
+                self._linear[nx] = _Linear(nx, models, outputs, squares, slow)
         return self._linear[nx] is not None
 
     def best_linear(self, orders: Sequence[int] = ()) -> _Linear:
@@ -484,9 +484,9 @@ class _Study:
                 "records, or set the sizes."
             )
         best = self._first_good(found)
-        if best.untold and (told := [each for each in found if not each.untold]):
-            other = self._first_good(told)
-            best = other if other.total <= _UNTOLD**2 * best.total else best
+        if best.slow and (faster := [each for each in found if not each.slow]):
+            other = self._first_good(faster)
+            best = other if other.total <= _SLOW**2 * best.total else best
         return best
 
     def _first_good(self, found: Sequence[_Linear]) -> _Linear:

@@ -72,7 +72,7 @@ class Memory(NamedTuple):
 
     @property
     def fades(self) -> bool:
-        """Tell whether the outputs converge, or stay apart little more than the linear model's."""
+        """Tell whether the outputs converge, or do so about as slowly as the linear model's."""
         return self.apart <= max(LIMIT, _SLOWER * self.linear)
 
     @property

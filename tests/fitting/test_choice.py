@@ -118,10 +118,9 @@ def test_orders_go_two_beyond_that_of_the_scan(monkeypatch):
 
 
 @pytest.mark.usefixtures("short_paths")
-@pytest.mark.parametrize("seed", [4, 6])
-def test_a_pole_slower_than_the_record_has_to_pay(seed: int):
+def test_a_pole_slower_than_the_record_has_to_pay():
     """It follows the drift of this record; of the system it says nothing."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(4)
     u, y = rng.standard_normal(200), np.zeros(200)
     for k in range(199):
         y[k + 1] = 0.6 * y[k] + u[k]
