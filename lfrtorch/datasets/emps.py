@@ -13,6 +13,10 @@ The input vir is a voltage; the authors' scripts convert it to a force by the dr
 in the files, which does not change the scores of a model. The pulses of the test file (pulses_N)
 are not an input in those scripts, nor here. The output is qm as stored, in metres.
 
+At the same speed the input drifts by 13 mV in the 25 s of the estimation file, since the friction
+does, and the feedback holds the position. A model that integrates turns 4 mV into 10 mm. So
+training can have copies of the record whose input is shifted.
+
 References:
     A. Janot, M. Gautier, M. Brunot (2019), "Data set and reference models of EMPS", Workshop on
     Nonlinear System Identification Benchmarks, Eindhoven.
@@ -20,11 +24,10 @@ References:
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
-from lfrtorch._support.checks import integer
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.checks import number
 from lfrtorch.data.dataset import Dataset
 from lfrtorch.data.records import Record
 from lfrtorch.datasets import official
@@ -36,67 +39,62 @@ _ARCHIVE = "EMPS/EMPS.zip"
 _FS = 1000.0  # Hz
 _SAMPLES = 24_841  # samples of each file
 _WINDOW = 20  # samples, unscored, of the test
+_SAME_PLACE = 1e-3  # m, between the first samples of files whose motions begin at one place
 
 
 def load(
     *,
     validation: float = 0.0,
-    warm_up: int = _WINDOW,
+    drift: float = 0.0,
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
     """Estimation measurement, cut in time into training and validation, and the test record.
 
-    All start states are estimated. An integrator never forgets its initial state: the position
-    error of a zero state is permanent, and no warm-up from zero state would remove it. Training
-    fits the start with the parameters; in validation and test it is fitted to the first samples,
-    which are not scored. Those of the validation record are the last ones of training.
+    The motion begins at rest. So training, validation and a test that begins at the same position
+    begin in the state 0, which a model with learned states may have anywhere. A test that begins
+    elsewhere begins in a state that is fitted to its first samples. Validation is a simulation of
+    all samples from the first one on, scored in those that do not train.
 
     Args:
-        validation: last fraction of the estimation samples, which validates. With 0 all samples
-            train, and random starts are judged on them as on the test: from a start state that is
-            fitted to the first samples alone.
-        warm_up: first samples of the validation record, to which its start state is fitted; they
-            train, too. Default: as many as for the test.
+        validation: last fraction of the estimation samples, which validates. With 0 all train.
+        drift: shift of the input (V), up and down, in copies of the training and validation
+            records with the same output. A model that is fitted to them does not integrate the
+            drift of the friction. With 0 there are no copies.
         download: download missing files.
         root: folder that holds ``EMPS/DATA_EMPS.mat`` and ``EMPS/DATA_EMPS_PULSES.mat``, or
             ``EMPS/EMPS.zip`` with both in it.
 
     Shape:
         u (V), y (m) of training: (24841, 1), or (19873, 1) with ``validation=0.2``; of validation:
-        (4988, 1), 4968 of them scored; of the test: (24841, 1), 24821 scored.
+        (24841, 1), 4968 of them scored; of the test: (24841, 1), 24821 scored.
 
     Example:
         >>> data = lfrtorch.datasets.emps.load(download=True)  # doctest: +SKIP
     """
-    integer("warm_up", warm_up, 1)
+    number("drift", drift)
     trained = _SAMPLES - (official.held_out(_SAMPLES, validation) if validation else 0)
-    if warm_up > trained:
-        raise InputError(
-            f"warm_up is {warm_up}, and there are {trained} samples before the validation record; "
-            "give fewer, or a smaller validation."
-        )
     path = official.find(root, _ESTIMATION, "EMPS", others=[_ARCHIVE], download=download)
     estimation = _measured(path, _ESTIMATION)
     found, notes = official.find_tests(
         root, {"test": _TEST}, "EMPS", others=[_ARCHIVE], download=download
     )
 
-    part = partial(official.part, start="estimated")
+    def copies(first: int, last: int, name: str) -> list[Record]:
+        whole = official.part(estimation, first, last, warm_up=first, name=name)
+        shifts = (drift, -drift) if drift else ()
+        return [whole, *(replace(whole, u=whole.u + d, name=f"{name}{d:+g} V") for d in shifts)]
 
-    def whole_but(unscored: int, name: str) -> Record:
-        return part(estimation, unscored, _SAMPLES, warm_up=warm_up, name=name)
-
-    tests = [
-        part(_measured(path, _TEST), _WINDOW, _SAMPLES, warm_up=_WINDOW, name=name)
-        for name, path in found.items()
-    ]
+    tests = []
+    for name, path in found.items():
+        whole = _measured(path, _TEST)
+        start = "zero" if abs(whole.y[0] - estimation.y[0]) < _SAME_PLACE else "estimated"
+        tests.append(replace(whole, name=name, skip=_WINDOW, start=start))
     return Dataset(
         name="emps",
-        train=[part(estimation, 0, trained, warm_up=0, name="train")],
-        validation=[] if trained == _SAMPLES else [whole_but(trained, "validation")],
+        train=copies(0, trained, "train"),
+        validation=copies(trained, _SAMPLES, "validation") if validation else [],
         tests=tests,
-        selection=[] if trained < _SAMPLES else [whole_but(warm_up, "from the first samples")],
         published=official.published("emps"),
         notes=notes,
         leaderboard=tests,

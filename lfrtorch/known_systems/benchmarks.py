@@ -62,11 +62,15 @@ _STICKS = 5e-4
 """Speed below which dry friction is smoothed, m/s."""
 
 
-def emps() -> Known:
+def emps(*, free: bool = False) -> Known:
     """Drive of a linear axis: a force moves a mass against viscous and dry friction.
 
-    Parameters are per unit of mass, since the position does not determine the mass. An offset and
-    a slope with the speed describe that friction differs between the two directions.
+    Parameters are per unit of mass, since the position does not determine the mass. An offset
+    describes that friction differs between the two directions.
+
+    Args:
+        free: what is learned beside the equations sees the position, too, and acts on the output:
+            then the model need not integrate. By default it sees the speed, and acts on it.
 
     References:
         Janot, Gautier and Brunot, "Data set and reference models of EMPS", Workshop on Nonlinear
@@ -81,8 +85,8 @@ def emps() -> Known:
         rates,
         states=[State("position", unit="m"), State("speed", unit="m/s")],
         outputs=lambda x, u, p: (x.position,),
-        sees=["speed"],
-        acts_on=["speed"],
+        sees=["position", "speed"] if free else ["speed"],
+        acts_on=["speed", "y"] if free else ["speed"],
         parameters={
             "gain": Parameter(0.35, low=0.0, unit="m/s² per V"),
             "viscous": Parameter(2.0, low=0.0, unit="1/s"),

@@ -59,8 +59,7 @@ REFUSED: dict[str, list[tuple[dict[str, Any], str]]] = {
     ],
     "emps": [
         ({"validation": 1.0}, "leaves 0 of the 24841"),
-        ({"warm_up": 0}, "warm_up is 0"),
-        ({"validation": 0.2, "warm_up": 19_874}, "is 19874, and there are 19873 samples before"),
+        ({"drift": -0.01}, "drift is -0.01; give a number of at least 0"),
     ],
     "f16": [
         ({"train": []}, "give one or more to train"),
