@@ -114,7 +114,8 @@ def nanodrone() -> Known:
 
     The thrust along the body's vertical axis and the torques are sums of squares of the motor
     speeds. Air damps speeds and rates, and its flow across the propellers turns the body. The
-    measured velocity comes from an estimator, so the position changes by a multiple of it. A step
+    measured velocity comes from an estimator, so the position changes by a multiple of it. Rates
+    ahead are uncertain, so the predicted rates are smaller than those that turn the body. A step
     over one sample uses the rates, and with them the attitude, at the middle of the sample.
 
     References:
@@ -156,6 +157,9 @@ def nanodrone() -> Known:
         old = (x.p, x.q, x.r)
         rates = [rate + _SAMPLE * torque for rate, torque in zip(old, torques, strict=True)]
         roll, pitch, yaw = (0.5 * (a + b) for a, b in zip(old, rates, strict=True))
+        roll = p.turn_x * roll + p.turn_roll * (third + fourth - first - second)
+        pitch = p.turn_y * pitch + p.turn_pitch * (second + third - first - fourth)
+        yaw = p.turn_z * yaw
         turning = (sr * pitch + cr * yaw) / cp
         angles = (
             x.roll + _SAMPLE * (roll + sp * turning),
@@ -176,11 +180,12 @@ def nanodrone() -> Known:
     free = {
         "push_x": 0.1, "push_y": 0.1, "tilt_x": 0.02, "tilt_y": 0.02, "linear": 0.3, "lead": 0.02,
         "flow_x": 3.0, "flow_y": 3.0, "bias_x": 1.0, "bias_y": 1.0, "bias_z": 1.0, "gyro_x": 0.3,
-        "gyro_y": 0.3, "gyro_z": 0.3,
+        "gyro_y": 0.3, "gyro_z": 0.3, "turn_roll": 0.1, "turn_pitch": 0.1,
     }  # fmt: skip
     begun = {
         "scale": 1.0, "scale_z": 1.0, "thrust": 0.8, "drag": 0.5, "drag_z": 0.5, "roll_gain": 25.0,
         "pitch_gain": 20.0, "yaw_gain": 4.0, "damp_x": 3.0, "damp_y": 3.0, "damp_z": 6.0,
+        "turn_x": 1.0, "turn_y": 1.0, "turn_z": 1.0,
     }  # fmt: skip
     units = {
         "m": ("x", "y", "z"), "m/s": ("vx", "vy", "vz"), "rad": ("roll", "pitch", "yaw"),
