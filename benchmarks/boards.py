@@ -40,11 +40,8 @@ F16: tuple[Sizes, ...] = ((2, 2, 15, 0), (2, 2, 15, 6))
 
 EMPS: tuple[tuple[str, float, float], ...] = (
     ("emps_known", 0.0, 10.0),
-    ("emps", 0.005, 1.0),
     ("emps", 0.01, 1.0),
-    ("emps", 0.01, 10.0),
     ("emps", 0.01, 100.0),
-    ("emps", 0.02, 1.0),
 )
 """Name of the bench, shift of the input (V), ridge."""
 

@@ -68,11 +68,10 @@ OUTPUTS = tuple(
 )
 _ANGLES = slice(6, 9)
 _WEIGHT = np.repeat([1.0, 1.0, 4.0, 1.0], 3)
-"""Weights of the squared errors in a fit: attitude errors count twice. On kinds of flight that are
-left out, all four sums are smaller then, or the same (``benchmarks/nanodrone.md``)."""
+"""Weights of squared errors in a fit: attitude counts twice (``benchmarks/nanodrone.md``)."""
 
 _ALL: Any = {"source": "official", "inputs": INPUTS, "outputs": OUTPUTS, "weight": _WEIGHT}
-"""What the records of all flights have."""
+"""Source, channels and weights of all flights."""
 
 
 def _euclidean(first: int) -> Callable[[Array, Array], Array]:

@@ -69,8 +69,8 @@ def emps(*, free: bool = False) -> Known:
     describes that friction differs between the two directions.
 
     Args:
-        free: what is learned beside the equations sees the position, too, and acts on the output:
-            then the model need not integrate. By default it sees the speed, and acts on it.
+        free: the learned part sees the position, too, and acts on the output, so that the model
+            need not integrate. By default it sees the speed alone, and acts on it.
 
     References:
         Janot, Gautier and Brunot, "Data set and reference models of EMPS", Workshop on Nonlinear
