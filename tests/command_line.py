@@ -24,7 +24,7 @@ SHORTER = {  # fewer samples and iterations, so that two iterations take a secon
     "cascaded_tanks": "bla.max_iter=1 starts=1",
     "cascaded_tanks_known": "bla.max_iter=1 starts=1 nn=2",
     "ced": "bla.max_iter=1 starts=1",
-    "emps": "data.validation=0.8 bla.max_iter=1 starts=1 refit=false",
+    "emps": "data.validation=0.8 bla.max_iter=1 starts=1",
     "emps_known": "data.validation=0.8 bla.max_iter=1 starts=1",
     "f16": "data.train=[multisine_3] data.validation=[multisine_5] nx=6 modes=1"
     " bla.max_iter=1 starts=1 first_part=1 refit=false",

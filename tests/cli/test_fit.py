@@ -66,6 +66,14 @@ ROUNDING = 1e-12
 """Of outputs of about 5, a thousand units in the last place: sums in another order."""
 
 
+OWN_DATA = {
+    ("boucwen_record", "rms"): [*8 * [50], *4 * [25], *4 * [10]],
+    ("emps", "validation"): 0.25,
+    ("emps", "drift"): 0.01,
+}
+"""Settings of the data that are not the loader's own."""
+
+
 @pytest.mark.parametrize("bench", BENCHES)
 def test_every_bench_composes(bench: str):
     cfg = configuration(f"+bench={bench}")
@@ -77,8 +85,8 @@ def test_every_bench_composes(bench: str):
     arguments = inspect.signature(get_object(cfg.data["_target_"])).parameters
     for name, argument in arguments.items():  # a bench is the loader's own default, spelt out
         default = argument.default
-        if (bench, name) == ("boucwen_record", "rms"):
-            assert cfg.data[name] == [*8 * [50], *4 * [25], *4 * [10]]
+        if (bench, name) in OWN_DATA:
+            assert cfg.data[name] == OWN_DATA[bench, name]
             continue
         assert cfg.data[name] == (list(default) if isinstance(default, tuple) else default)
 
