@@ -1,11 +1,13 @@
 """How settings of the mirror, the F-16 and EMPS do on estimation records that were left out.
 
-    python benchmarks/boards.py --root DIR [--only mirror f16 emps]
+    python benchmarks/boards.py --root DIR [--only mirror f16 drift emps]
 
 Official test records are not looked at; ``boards.md`` has what it printed. Of the mirror two
 realisations of each level are fitted and the other four are simulated: µm, mean over realisations,
 periods and outputs. Of the F-16 the levels 1, 3 and 7 are fitted and level 5 is simulated: first
-acceleration, m/s². Of EMPS the first half or three quarters are fitted, and all of it is simulated
+acceleration, m/s². Drift: the mean input of EMPS at its highest speed ahead and back in each of
+four motions, half their sum (offset) and half their difference (size of the friction), mV. Of EMPS
+the first half or three quarters are fitted, and all of it is simulated
 from its beginning: mm, in the quarters that were left out, with the input as it is and 10 mV off.
 """
 
@@ -37,6 +39,9 @@ MIRROR: tuple[Sizes, ...] = (
 F16_ITERATIONS = 60
 F16: tuple[Sizes, ...] = ((2, 2, 15, 0), (2, 2, 15, 6))
 """nz, nw, nn and modes."""
+
+MOTION, FAST = 6240, 0.124
+"""Samples of a motion of EMPS; speed above which it counts as the highest, m/s."""
 
 EMPS: tuple[tuple[str, float, float], ...] = (
     ("emps_known", 0.0, 10.0),
@@ -111,6 +116,22 @@ def of_f16(root: Path) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
     return heads, rows()
 
 
+def of_drift(root: Path) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
+    """The input at the highest speed, in each motion."""
+    (record,) = emps.load(root=root).train
+    u, y = record.u[50:-50, 0], record.y[:, 0]
+    speed = (y[100:] - y[:-100]) * record.fs / 100
+    heads = "motion", "ahead", "back", "offset", "friction"
+
+    def rows() -> Iterable[Sequence[Any]]:
+        for number in range(4):
+            part = slice(number * MOTION, (number + 1) * MOTION)
+            ahead, back = (1e3 * float(u[part][way * speed[part] > FAST].mean()) for way in (1, -1))
+            yield number + 1, ahead, back, (ahead + back) / 2, (ahead - back) / 2
+
+    return heads, rows()
+
+
 def of_emps(root: Path) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
     """The first part of the record: what follows, simulated from the beginning of the record."""
     (whole,) = emps.load(root=root).train
@@ -142,6 +163,7 @@ def of_emps(root: Path) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
 BOARDS: dict[str, Callable[[Path], tuple[Sequence[str], Iterable[Sequence[Any]]]]] = {
     "mirror": of_mirror,
     "f16": of_f16,
+    "drift": of_drift,
     "emps": of_emps,
 }
 

@@ -13,8 +13,8 @@ The input vir is a voltage; the authors' scripts convert it to a force by the dr
 in the files, which does not change the scores of a model. The pulses of the test file (pulses_N)
 are not an input in those scripts, nor here. The output is qm as stored, in metres.
 
-At the same speed the input drifts by 13 mV in the 25 s of the estimation file, since the friction
-does, and the feedback holds the position. A model that integrates turns 4 mV into 10 mm. So
+At the same speed the input drifts by 14 mV in the 25 s of the estimation file, since the friction
+drifts and the feedback holds the position. A model that integrates turns 10 mV into 20 mm. So
 training can have copies of the record whose input is shifted.
 
 References:
@@ -82,8 +82,8 @@ def load(
 
     def copies(first: int, last: int, name: str) -> list[Record]:
         whole = official.part(estimation, first, last, warm_up=first, name=name)
-        shifts = (drift, -drift) if drift else ()
-        return [whole, *(replace(whole, u=whole.u + d, name=f"{name}{d:+g} V") for d in shifts)]
+        others = {f"{name}_up": drift, f"{name}_down": -drift} if drift else {}
+        return [whole, *(replace(whole, u=whole.u + d, name=n) for n, d in others.items())]
 
     tests = []
     for name, path in found.items():

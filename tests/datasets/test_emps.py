@@ -71,7 +71,7 @@ def test_copies_with_a_shifted_input(numbered):
         assert np.allclose(up.u - plain.u, 0.01)
         assert np.allclose(down.u - plain.u, -0.01)
         assert all(np.array_equal(plain.y, r.y) and r.skip == plain.skip for r in records)
-    assert [r.name for r in data.train] == ["train", "train+0.01 V", "train-0.01 V"]
+    assert [r.name for r in data.train] == ["train", "train_up", "train_down"]
 
 
 def test_the_archive_does_as_well(tmp_path):

@@ -158,6 +158,11 @@ def test_a_run_has_the_sums_of_the_kind_that_is_left_out(flights: Path) -> None:
     assert shown.startswith("RMSE of predictions 10 samples ahead")
 
 
+def test_attitude_errors_count_twice(flights: Path) -> None:
+    (weight,) = {tuple(np.ravel(r.weight)) for r in nanodrone.load(root=flights).train}
+    assert weight == (*6 * [1.0], *3 * [4.0], *3 * [1.0])
+
+
 def test_the_benchmark_has_its_equations_and_horizon() -> None:
     cfg = composed("config", ["+bench=nanodrone"])
     assert cfg.horizon == nanodrone.HORIZON
