@@ -48,6 +48,7 @@ _NAMES = {
     "fitting.snapshots": "Snapshots",
     "fitting.starts": "initialise",
     "fitting.trainer": "FitResult",
+    "fitting.update": "Update update",
     "_support.reasons": "Reason",
     "least_squares.adam": "Adam",
     "least_squares.levenberg_marquardt": "LevenbergMarquardt",

@@ -35,6 +35,7 @@ from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.trainer import FitResult
+from lfrtorch.fitting.update import Update, update
 from lfrtorch._support.reasons import Reason
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -85,6 +86,7 @@ __all__ = [
     "Snapshots",
     "State",
     "StaticMap",
+    "Update",
     "analysis",
     "choose_sizes",
     "datasets",
@@ -108,4 +110,5 @@ __all__ = [
     "rmse",
     "scan_orders",
     "simulate_blocks",
+    "update",
 ]

@@ -35,7 +35,7 @@ def check_plain(cfg: DictConfig) -> None:
     require_data(cfg)
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     plain["known"] = plain["known"]["_target_"]
-    brought = plain["init_from"] is not None or plain["known"] is not None
+    brought = any(plain[n] is not None for n in ("init_from", "update", "known"))
     if cfg.nx is None and not brought:
         raise InputError(
             "nx, the number of states, is not set: add nx=2, for example, or nx=auto "

@@ -56,7 +56,7 @@ def in_full(command: str, given: Sequence[str]) -> list[str]:
 def of_newest(word: str) -> str:
     """The word; if its value is a folder of runs, where a model is wanted, the newest run in it."""
     name, _, value = word.partition("=")
-    if name not in ("checkpoint", "init_from"):
+    if name not in ("checkpoint", "init_from", "update"):
         return word
     folder = expanded(str(parsed(word).value()))
     runs = [run for run in folder.glob("*") if _DATE.fullmatch(run.name) and _has_model(run)]
@@ -78,7 +78,9 @@ def chosen_by_data(words: Sequence[str]) -> list[str]:
     pairs = [word.lstrip("+").partition("=") for word in words]
     given = {name: value for name, _, value in pairs}
     names = {name.split(".")[0] for name in given}
-    if given.get("data") != "file" or not names.isdisjoint({"bench", "resume", "init_from"}):
+    if given.get("data") != "file" or not names.isdisjoint(
+        {"bench", "resume", "init_from", "update"}
+    ):
         return []
     last = "degree" if given.get("static") == "polynomial" else "nn"
     static = {"nz", "nw", last}

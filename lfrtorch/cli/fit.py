@@ -4,6 +4,7 @@ lfrtorch fit +bench=boucwen
 lfrtorch fit -m +bench=boucwen 'seed=range(20)' nn=5,10 hydra.sweep.dir=DIR
 lfrtorch fit resume=runs/boucwen/DATE
 lfrtorch fit x.csv inputs=force outputs=disp fs=750 nx=3
+lfrtorch fit update=runs/run new.csv inputs=force outputs=disp fs=750
 torchrun --nproc-per-node 2 -m lfrtorch.cli fit ...
 """
 
@@ -27,6 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.reasons import Reason
 from lfrtorch.cli import sweep
+from lfrtorch.cli.checks import check_plain
 from lfrtorch.cli.config import configured, limit_threads, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.interrupts import TerminatedError, Termination
@@ -41,6 +43,7 @@ from lfrtorch.cli.run_folder import (
     program,
     resumable,
 )
+from lfrtorch.cli.update import updated
 from lfrtorch.data.dataset import Dataset
 from lfrtorch.distributed import ProcessLostError, agreed, connect, current
 from lfrtorch.fitting.observer import Watching
@@ -61,6 +64,10 @@ def run(cfg: DictConfig, folder: Path, command: str = "") -> float:
     # If a fit ended early, its files are written before the error is raised.
     first = current().rank == 0
     cfg = chosen_before(cfg, folder)
+    if cfg["update"] is not None:  # cfg.update is a method of a mapping
+        check_plain(cfg)
+        limit_threads(cfg)
+        return updated(cfg, loaded(cfg), folder)
     settings = configured(cfg)
     limit_threads(cfg)
     dataset = loaded(cfg)

@@ -142,6 +142,15 @@ class Jacobian:
         whole[states.place] = torch.einsum("rij,ri->rj", states.Vh, states.s * states.r)
         return system, whole
 
+    def triangle(self) -> Float[Tensor, "K P"]:
+        """R with RᵀR = JᵀJ, without penalties, for a Jacobian that keeps all columns."""
+        total = QRAccumulator()
+        for part in self.parts:
+            if not isinstance(part, PenaltyRows):
+                part.fold(self._reduced.kept, total, 0)
+        self._complete(total)
+        return self._project(total.R[:, :-1])
+
     def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """J dθ."""
         d_theta = self._project(d_theta)

@@ -19,6 +19,7 @@ from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
 from lfrtorch.least_squares.held_steps import HeldSteps
 from lfrtorch.least_squares.jacobian import Jacobian
+from lfrtorch.least_squares.prior import PriorPenalty
 from lfrtorch.least_squares.record_groups import EVERY
 from lfrtorch.least_squares.residual import LeastSquares, Point
 from lfrtorch.least_squares.ridge import Ridge, RidgePenalty, ridge_by_entry
@@ -125,10 +126,14 @@ class Problem(LeastSquares):
         """Write θ to the weights of the LFR."""
         self.errors.parameters.write(self.lfr.cell, theta)
 
-    def weigh(self, ridge: Ridge) -> None:
-        """Give the ridge another weight; it still pulls towards θ_0."""
+    def weigh(self, ridge: Ridge | Tensor) -> None:
+        """Give the ridge another weight, or the rows of a prior; both pull towards θ_0."""
+        penalties = RidgePenalty, PriorPenalty
+        self._terms = [term for term in self._terms if not isinstance(term, penalties)]
+        if isinstance(ridge, Tensor):
+            self._terms.append(PriorPenalty(ridge, self.theta))
+            return
         weight = ridge_by_entry(ridge, self.errors.parameters.sizes)
-        self._terms = [term for term in self._terms if not isinstance(term, RidgePenalty)]
         if weight.any():
             self._terms.append(RidgePenalty(weight, self.theta))
 
@@ -204,7 +209,9 @@ class Problem(LeastSquares):
     @cached_property
     def _worth_reducing(self) -> bool:
         """Tell if it saves time to find the dependent columns and leave them out."""
-        # The damping also handles gauge directions, so only time decides.
+        # The damping also handles gauge directions, so only time decides, but for a prior.
+        if any(isinstance(term, PriorPenalty) for term in self._terms):
+            return False
         W, P = self.lfr.cell.weights(), len(self.theta)
         sizes = [s.place.stop - s.place.start for s in W.map.symmetries]
         left = P - W.nx**2 - sum(n**2 for n in sizes)

@@ -66,7 +66,7 @@ class SharedProblem(Problem):
         point = self.evaluate(state.theta)
         return replace(state, residual=point.residual, seen=point.seen)
 
-    def weigh(self, ridge: Ridge) -> None:
+    def weigh(self, ridge: Ridge | Tensor) -> None:
         """Give the ridge another weight; only the first process has the rows of the ridge."""
         super().weigh(ridge if self._ranks.rank == 0 else 0.0)
 

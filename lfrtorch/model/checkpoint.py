@@ -18,6 +18,7 @@ from lfrtorch.engine import held
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.model.data_reach import Cloud, DataReach
+from lfrtorch.model.information import Information
 from lfrtorch.model.model import Model
 
 MapMaker = Callable[[Any, int, int, torch.dtype], Module | None]
@@ -61,6 +62,11 @@ def _made(description: dict[str, Any], weights: dict[str, Tensor], maker: MapMak
     static = maker(description["static"], sizes["nz"], sizes["nw"], dtype)
     cell = LFRCell(**sizes, static=static, dtype=dtype, random=False).to(dtype)
     K, masks, parts = weights.pop("K", None), _under(weights, "fixed."), _under(weights, "reach.")
+    told, information = _under(weights, "information."), None
+    if told:
+        information = Information(
+            told["theta"], told["R"], *(float(told[n]) for n in ("rmse", "samples"))
+        )
     reach = None
     if parts:
         names = ("u", "y", "middle", "axes", "ends", "farthest")
@@ -80,7 +86,7 @@ def _made(description: dict[str, Any], weights: dict[str, Tensor], maker: MapMak
         cell.hold(given)
     inputs, outputs = (described_channels(description[side]) for side in ("inputs", "outputs"))
     about = float(description["fs"]), inputs, outputs, str(description.get("fitted_to", ""))
-    return Model(LFR(cell), scaler, *about, K, reach)
+    return Model(LFR(cell), scaler, *about, K, reach, information)
 
 
 def _under(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -57,6 +57,7 @@ from lfrtorch.model.extended_kalman_filter import (
     inside_limits,
     with_variances,
 )
+from lfrtorch.model.information import Information
 from lfrtorch.model.state_observer import StateObserver, SteadyGainObserver
 
 NO_OBSERVER = (
@@ -124,6 +125,7 @@ class Model:
             normalised. Default: no noise model; ``lfrtorch.fit`` finds one with
             ``noise="innovation"``.
         reach: range of the data; ``reaching`` finds it.
+        information: that of the data on the parameters, for ``lfrtorch.update``.
 
     Shape:
         K: (nx, ny).
@@ -153,6 +155,7 @@ class Model:
     fitted_to: str = ""
     K: Float[Tensor, "nx ny"] | None = None
     reach: DataReach | None = None
+    information: Information | None = None
 
     def __post_init__(self) -> None:
         cell, s = self.lfr.cell, self.scaler
@@ -842,6 +845,9 @@ def write_model(
         weights["K"] = model.K
     if model.reach is not None:
         weights |= {f"reach.{name}": torch.tensor(v) for name, v in _flat(model.reach).items()}
+    if model.information is not None:
+        told = vars(model.information)
+        weights |= {f"information.{name}": torch.as_tensor(value) for name, value in told.items()}
     return checkpoint.write(folder, description, weights)
 
 

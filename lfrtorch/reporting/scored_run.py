@@ -16,6 +16,7 @@ from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.refit import estimation_records
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Job
+from lfrtorch.fitting.update import informed
 from lfrtorch.fitting.windows import begins_at_outputs, windows
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
@@ -43,11 +44,13 @@ def scored_run(job: Job) -> Run:
     samples = sum(record.samples for record in dataset.train)
     fitted_to = f"{dataset.name}: {len(dataset.train)} record(s), {samples} samples"
     model = replace(result.model, fitted_to=fitted_to).reaching(dataset.train)
+    model = informed(model, dataset.train, settings.horizon)
     result = replace(result, model=model)
     if again is not None:
         fitted_to += " and all other estimation records"
         known = [*dataset.train, *dataset.validation, *dataset.selection]
-        again = replace(again, model=replace(again.model, fitted_to=fitted_to).reaching(known))
+        told = replace(again.model, fitted_to=fitted_to).reaching(known)
+        again = replace(again, model=informed(told, estimation_records(dataset), settings.horizon))
     evaluation = Evaluation(
         dataset=dataset,
         linear=opposed[None],
