@@ -98,3 +98,15 @@ def test_ray_fits_many_settings(capfd: pytest.CaptureFixture[str]):
     assert len(found) == 6
     assert found == sorted(found)
     assert found[0] < 0.015  # the noise has 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.numeric
+def test_an_identified_motor_in_mujoco_is_closer_than_a_perceptron(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    pytest.importorskip("mujoco", reason="pip install mujoco")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(EXAMPLES)
+    errors = runpy.run_path(str(EXAMPLES / "mujoco_pendulum.py"))["main"]()
+    assert errors["NL-LFR"] < 0.3 * errors["perceptron"]

@@ -7,6 +7,7 @@ from lfrtorch.export.fmu import write_fmu
 from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
 from lfrtorch.export.targets import TARGETS, write
+from lfrtorch.export.torch_program import torch_modules
 
 __all__ = [
     "TARGETS",
@@ -18,6 +19,7 @@ __all__ = [
     "matlab_function",
     "onnx_models",
     "python_source",
+    "torch_modules",
     "write",
     "write_fmu",
 ]

@@ -179,7 +179,7 @@ def equations(
         raise InputError(
             f"the static map is a {type(cell.static).__name__}, a class of your own, whose "
             "equations are not known.\nA Network, a Polynomial, a known model or a StaticMap with "
-            "equations can be exported, and your class to onnx alone."
+            "equations can be exported, and your class to onnx and torch alone."
         )
     M, y_scale = cell.matrices(), s.y_scale[:, None]
     found = Equations(

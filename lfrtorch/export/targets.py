@@ -22,6 +22,7 @@ from lfrtorch.export.equations import equations
 from lfrtorch.export.fmu import fmu
 from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
+from lfrtorch.export.torch_program import torch_files
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model.extended_kalman_filter import NoiseCovariance
 from lfrtorch.model.model import Disturbance, Model
@@ -124,6 +125,7 @@ TARGETS = {
     ),
     "fmu": Target(partial(_fmu, version=2), "found = fmpy.simulate_fmu('{path}')"),
     "fmu3": Target(partial(_fmu, version=3), "found = fmpy.simulate_fmu('{path}')"),
+    "torch": Target(torch_files, "x_next, y = torch.jit.load('{path}')(x, u)"),
 }
 """Targets by name."""
 
@@ -149,7 +151,8 @@ def write(
             ``"onnx"``: ``NAME.onnx`` for a sample and ``NAME_simulate.onnx``; ``"matlab"``:
             ``NAME.m``, ``NAME_numbers.m`` and ``NAME_lpv.m`` with ``NAME.mat``; ``"control"``:
             ``NAME.py``, whose ``system()`` is a ``control.NonlinearIOSystem``; ``"fmu"`` and
-            ``"fmu3"``: ``NAME.fmu``, FMI 2.0 or 3.0.
+            ``"fmu3"``: ``NAME.fmu``, FMI 2.0 or 3.0; ``"torch"``: ``NAME.pt``, TorchScript in
+            float32, and ``NAME.pt2`` and ``NAME_simulate.pt2``, programs of ``torch.export``.
         folder: folder of the files; it is created if needed.
         name: name of the files and of the model in them.
         overwrite: replace files that exist.
