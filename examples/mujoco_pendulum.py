@@ -138,7 +138,8 @@ def main() -> dict[str, float]:
     torque = log[:, 2] + NOISE * log[:, 2].std() * rng.standard_normal(len(log))
     record = lfrtorch.Record(
         inputs, torque, fs=FS, start="zero",
-        inputs=[("error", "rad"), ("velocity", "rad/s")], outputs=[("torque", "N m")],
+        inputs=(lfrtorch.Channel("error", "rad"), lfrtorch.Channel("velocity", "rad/s")),
+        outputs=(lfrtorch.Channel("torque", "N m"),),
     )  # fmt: skip
     settings = lfrtorch.Settings(nx=2, nz=3, nw=2, nn=10, starts=8)
     run = lfrtorch.identify(record, settings)

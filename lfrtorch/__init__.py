@@ -42,6 +42,7 @@ _NAMES = {
     "fitting.forgetting": "Memory forgets",
     "fitting.means": "mean_model",
     "fitting.multistart": "fit",
+    "fitting.next_experiment": "Experiment next_experiment",
     "fitting.noise_estimate": "estimate_noise",
     "fitting.refit": "refit",
     "fitting.choice": "Choice choose_sizes",

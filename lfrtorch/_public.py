@@ -29,6 +29,7 @@ from lfrtorch.model.model import Model, simulate_blocks
 from lfrtorch.fitting.forgetting import Memory, forgets
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.next_experiment import Experiment, next_experiment
 from lfrtorch.fitting.noise_estimate import estimate_noise
 from lfrtorch.fitting.refit import refit
 from lfrtorch.fitting.choice import Choice, choose_sizes
@@ -60,6 +61,7 @@ __all__ = [
     "Channel",
     "Choice",
     "Dataset",
+    "Experiment",
     "FitResult",
     "InputError",
     "Known",
@@ -103,6 +105,7 @@ __all__ = [
     "load_records",
     "mean_model",
     "multisine",
+    "next_experiment",
     "nrmse",
     "preview",
     "refit",

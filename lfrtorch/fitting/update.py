@@ -37,12 +37,13 @@ from lfrtorch._support.tables import table
 from lfrtorch._support.types import Array
 from lfrtorch.data.paired_blocks import Judge
 from lfrtorch.data.records import Record, as_records, with_past_outputs
+from lfrtorch.engine.operating_point import double, equilibrium, linearised_at
 from lfrtorch.fitting.folds import Fold, as_folded, folds
+from lfrtorch.fitting.information import as_fitted, information_rows, informed
 from lfrtorch.fitting.trainer import Trainer
 from lfrtorch.fitting.windows import windows
 from lfrtorch.least_squares.guarantee import guarantee_of
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.linear_systems import QRAccumulator
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.search import Search
 from lfrtorch.model.information import Information
@@ -60,8 +61,17 @@ FOLDS = 4
 SHORT = 10
 """Iterations for each ρ and fold; each search begins where that of the ρ before ended."""
 
+_FIRMER = 100.0
+"""Factor on the weight while the new model is unstable at rest."""
+
+_LARGEST = 1e4
+"""Weight up to which it is raised."""
+
 _SETTLED = 1e-3
 """A search for ρ ends if four iterations lower the cost by less than this fraction."""
+
+_CIRCLE = 1e-6
+"""Distance of a pole from the unit circle that is not called unstable: exact integrators."""
 
 _TOLD = 1e-12
 """Smallest singular value of an information's root, relative to the largest, above rounding."""
@@ -137,7 +147,8 @@ def update(
         records: new records of its channels and rate, of any length.
         prior: the old records, for a model that does not know what its data told.
         weight: ρ, how much the old data count beside the new ones. Default: cross-validation on the
-            new records finds it; 1 if these are too short.
+            new records finds it; 1 if these are too short. It is raised if the new model would be
+            unstable at rest and the old one is stable.
         horizon: as in the fit of the model, see ``lfrtorch.fit``.
         trainer: the search. Default: Levenberg-Marquardt with 50 iterations.
 
@@ -163,11 +174,14 @@ def update(
     data = given if model.K is None else [*map(with_past_outputs, given)]
     weight = own.chosen(data) if weight is None else weight
     found, theta = own.fitted(data, weight)
+    while not _stable(found) and _stable(own.model) and weight < _LARGEST:
+        weight *= _FIRMER
+        found, theta = own.fitted(data, weight)
     known = (one.lfr.cell.map.known for one in (own.model, found))
     old, new = ({} if one is None else one.physical for one in known)
     values = {name: (float(old[name]), float(new[name])) for name in old}
     R = math.sqrt(weight) * own.kept.R
-    _, rows, _, size = _rows(found, own.cut(data))
+    _, rows, _, size = information_rows(found, own.cut(data))
     R = torch.linalg.qr(torch.cat([R, rows / own.kept.rmse]), mode="r").R
     samples = weight * own.kept.samples + size
     information = replace(own.kept, theta=theta, R=R, samples=samples)
@@ -176,17 +190,6 @@ def update(
     said = f"{model.fitted_to}, updated with {sum(r.samples for r in given)} samples".lstrip(", ")
     result = replace(result, information=information, fitted_to=said)
     return Update(result, weight, before, after, own.moved(theta), values)
-
-
-def informed(model: Model, records: Record | Sequence[Record], horizon: int | None = None) -> Model:
-    """The model with what these records, those of its fit, tell of its parameters."""
-    data = as_records(records)
-    own = model if model.K is None else model.predictor()
-    data = data if model.K is None else [*map(with_past_outputs, data)]
-    theta, rows, rmse, size = _rows(own, _cut(own, data, horizon))
-    if not (math.isfinite(rmse) and torch.isfinite(rows).all()):
-        return replace(model, information=None)
-    return replace(model, information=Information(theta, rows / rmse, rmse, size))
 
 
 class _Search:
@@ -208,7 +211,7 @@ class _Search:
 
     def cut(self, records: Sequence[Record]) -> Sequence[Record]:
         """Records as they are fitted."""
-        return _cut(self.model, records, self.horizon)
+        return as_fitted(self.model, records, self.horizon)
 
     def fitted(
         self,
@@ -281,27 +284,14 @@ class _Search:
         return found
 
 
-def _cut(model: Model, records: Sequence[Record], horizon: int | None) -> Sequence[Record]:
-    """Records as a fit cuts them."""
-    if horizon is None:
-        return records
-    return windows(records, horizon, model.lfr.cell.nx, y_scale=model.scaler.y_scale)
-
-
-def _rows(
-    model: Model, records: Sequence[Record]
-) -> tuple[Float[Tensor, " P"], Float[Tensor, "K P"], float, int]:
-    """θ, R with RᵀR = JᵀJ without start states, the rms error, and the number of errors."""
-    total, squares, size, theta = QRAccumulator(), 0.0, 0, torch.zeros(0)
-    for record in records:
-        problem = Problem.of(model, [record])
-        point, own = problem.evaluate(problem.theta), problem.errors.parameters.own
-        theta = point.theta[:own]
-        J = problem.linearise_at(point, reduce=False, eliminate=False).triangle()
-        states = J.shape[1] - own  # first, so that all rows but theirs are without them
-        total.fold(torch.linalg.qr(J.roll(states, 1), mode="r").R[states:, states:])
-        squares, size = squares + point.cost, size + problem.size
-    return theta, total.R, math.sqrt(squares / size), size
+def _stable(model: Model) -> bool:
+    """Tell if the model linearised at rest is stable; True if it has no rest."""
+    cell = double(model.lfr.cell)
+    u = cell.A.new_zeros(cell.nu)
+    x = equilibrium(cell, u)
+    if x is None or not cell.nx:
+        return True
+    return bool(np.abs(np.linalg.eigvals(linearised_at(cell, u, x).A)).max() <= 1.0 + _CIRCLE)
 
 
 def _errors(model: Model, records: Sequence[Record]) -> Array:

@@ -11,12 +11,12 @@ from lfrtorch._support.threads import each_alone
 from lfrtorch.analysis.physical_parameters import physical_parameters
 from lfrtorch.data.dataset import Dataset
 from lfrtorch.fitting.forgetting import forgets
+from lfrtorch.fitting.information import informed
 from lfrtorch.fitting.linear_start import linear_records, of_linear_model, tell
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.refit import estimation_records
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.stage import Job
-from lfrtorch.fitting.update import informed
 from lfrtorch.fitting.windows import begins_at_outputs, windows
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel

@@ -27,7 +27,7 @@ from lfrtorch import (
     rmse,
     update,
 )
-from lfrtorch.fitting.update import informed
+from lfrtorch.fitting.information import informed
 from lfrtorch.least_squares.problem import Problem
 
 pytestmark = pytest.mark.numeric
@@ -148,6 +148,26 @@ def test_windows_and_single_precision():
     found = update(model, second, prior=first, horizon=50)
     assert found.model.lfr.cell.A.dtype == torch.float32
     assert found.after[0] < 1e-4
+
+
+def resonance(seed: int, samples: int, radius: float, noise: float = 0.02) -> Record:
+    """A resonance behind a saturation."""
+    rng, pole = np.random.default_rng(seed), radius * np.exp(0.3j)
+    u, y, x = rng.standard_normal(samples), np.zeros(samples), 0.0j
+    for k in range(samples):
+        y[k] = x.real + noise * rng.standard_normal()
+        x = pole * x + 0.1 * np.tanh(u[k])
+    return Record(u, y, start="zero")
+
+
+def test_a_stable_model_stays_stable_at_rest():
+    first, second = resonance(0, 1500, 0.99), resonance(1, 150, 1.01)
+    begun = initialise(estimate_bla(first, nx=2), first, nz=1, nw=1, nn=3)
+    begun = fit(begun, first, trainer=LevenbergMarquardt(max_iter=40), monitors=[]).model
+    found = update(begun, second, prior=first, weight=1e-4)
+    assert found.weight > 1e-4
+    later = found.model.simulate(resonance(2, 4000, 0.99))
+    assert np.abs(later).max() < 10.0 * np.abs(first.y).max()
 
 
 def test_values_of_known_equations():
