@@ -18,7 +18,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number, table
 from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.data.dataset import Dataset
-from lfrtorch.data.metrics import rmse
+from lfrtorch.data.metrics import rmse_by_output
 from lfrtorch.fitting.refit import estimation_records
 from lfrtorch.fitting.update import update
 from lfrtorch.model.model import Model, check_channels
@@ -27,6 +27,8 @@ from lfrtorch.model.model import Model, check_channels
 def updated(cfg: DictConfig, dataset: Dataset, folder: Path) -> float:
     """Update the model with all but the test records, write its files; return the new rms error."""
     given = str(cfg["update"])
+    if cfg.init_from is not None:
+        raise InputError("update and init_from both name a model to begin with; give one of them.")
     old = lfrtorch.load(given)
     if not isinstance(old, Model) or not old.lfr.cell.nw:
         raise InputError(
@@ -39,12 +41,16 @@ def updated(cfg: DictConfig, dataset: Dataset, folder: Path) -> float:
     )
     print(f"{found}\n")
     scores: dict[str, Any] = {}
+    rows: list[list[Any]] = []
     for record in dataset.tests:
-        before, after = (rmse(record, model.simulate(record)) for model in (old, found.model))
-        scores[record.name] = {"before": before, "after": after}
-    if scores:
-        rows = [[name, *map(number, own.values())] for name, own in scores.items()]
-        print(table(["rms error on tests", "before", "after"], rows) + "\n")
+        before, after = (
+            rmse_by_output(record, model.simulate(record)) for model in (old, found.model)
+        )
+        scores[record.name] = {"before": before.tolist(), "after": after.tolist()}
+        for channel, *own in zip(old.outputs, before, after, strict=True):
+            rows.append([record.name, channel.name, *map(number, own), channel.unit])
+    if rows:
+        print(table(["rms error on", "output", "before", "after", "unit"], rows) + "\n")
     found.model.save(folder / "model")
     entries = {
         "weight": found.weight,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lfrtorch.data.records import Record, as_records, with_past_outputs
@@ -17,16 +17,30 @@ from lfrtorch.least_squares.problem import Problem
 from lfrtorch.model.information import Information
 from lfrtorch.model.model import Model
 
+LARGEST = 3000
+"""Number of entries of θ, with those that a fit holds, up to which their information is kept."""
+
 
 def informed(model: Model, records: Record | Sequence[Record], horizon: int | None = None) -> Model:
     """The model with what these records, those of its fit, tell of its parameters."""
     data = as_records(records)
     own = model if model.K is None else model.predictor()
+    if free_entries(own).numel() > LARGEST:
+        return replace(model, information=None)
     data = data if model.K is None else [*map(with_past_outputs, data)]
     theta, rows, rmse, size = information_rows(own, as_fitted(own, data, horizon))
-    if not (math.isfinite(rmse) and torch.isfinite(rows).all()):
+    if not (0.0 < rmse < math.inf and torch.isfinite(rows).all()):
         return replace(model, information=None)
     return replace(model, information=Information(theta, rows / rmse, rmse, size))
+
+
+def free_entries(model: Model) -> Bool[Tensor, " P"]:
+    """Mask of the entries of θ that a fit does not hold."""
+    cell = model.lfr.cell
+    free = [(name, p) for name, p in cell.named_parameters() if p.requires_grad]
+    none = torch.zeros(0, dtype=torch.bool)
+    held = (cell.held.get(n, torch.zeros_like(p, dtype=torch.bool)).flatten() for n, p in free)
+    return ~torch.cat([none, *(mask.cpu() for mask in held)])
 
 
 def as_fitted(model: Model, records: Sequence[Record], horizon: int | None) -> Sequence[Record]:
@@ -38,15 +52,17 @@ def as_fitted(model: Model, records: Sequence[Record], horizon: int | None) -> S
 
 def information_rows(
     model: Model, records: Sequence[Record]
-) -> tuple[Float[Tensor, " P"], Float[Tensor, "K P"], float, int]:
-    """θ, R with RᵀR = JᵀJ without start states, the rms error, and the number of errors."""
+) -> tuple[Float[Tensor, " P"], Float[Tensor, "K free"], float, int]:
+    """θ, R with RᵀR = JᵀJ in its free entries, without start states, rms and number of errors."""
     total, squares, size, theta = QRAccumulator(), 0.0, 0, torch.zeros(0)
+    free = torch.nonzero(free_entries(model)).squeeze(1)
     for record in records:
         problem = Problem.of(model, [record])
         point, own = problem.evaluate(problem.theta), problem.errors.parameters.own
         theta = point.theta[:own]
-        J = problem.linearise_at(point, reduce=False, eliminate=False).triangle()
-        states = J.shape[1] - own  # first, so that all rows but theirs are without them
+        columns = torch.cat([free, torch.arange(own, len(point.theta))])
+        J = problem.linearise_at(point, reduce=False, eliminate=False).triangle(columns)
+        states = len(columns) - len(free)  # first, so that all rows but theirs are without them
         total.fold(torch.linalg.qr(J.roll(states, 1), mode="r").R[states:, states:])
         squares, size = squares + point.cost, size + problem.size
     return theta, total.R, math.sqrt(squares / size), size

@@ -31,7 +31,7 @@ from lfrtorch._support.tables import number, table
 from lfrtorch._support.types import Array, Booleans
 from lfrtorch.data.excitation import multisine
 from lfrtorch.data.records import Record, as_records, with_past_outputs
-from lfrtorch.fitting.information import information_rows, informed
+from lfrtorch.fitting.information import LARGEST, free_entries, information_rows, informed
 from lfrtorch.model.model import Model
 
 STRETCHES = 8
@@ -147,7 +147,10 @@ def next_experiment(
     bounds = _Bounds(model, data, limits or {})
     told = informed(model, data).information
     if told is None:
-        raise InputError("the model diverges on the records; give those that it was fitted to.")
+        raise InputError(
+            "the records tell nothing about the model: it diverges on them, fits them exactly, or "
+            f"is a mean of more than {LARGEST} parameters. Give the records of its fit."
+        )
     old = (told.R.mT @ told.R).numpy()
     seen = np.concatenate([_z(model, r.u) for r in data])
     rng, length = np.random.default_rng(seed), -(-count // STRETCHES)
@@ -197,8 +200,9 @@ class _Bounds:
     def kept(self, u: Float[Array, "T nu"]) -> Float[Array, "T nu"]:
         """The input about the middle, scaled down until it keeps all limits."""
         v = u - self.middle
-        for k in range(1, len(v)):
-            v[k] = np.clip(v[k], v[k - 1] - self._du, v[k - 1] + self._du)
+        before = np.zeros_like(self.middle)  # the experiment begins at rest in the middle
+        for k in range(len(v)):
+            before = v[k] = np.clip(v[k], before - self._du, before + self._du)
         half = (self.high - self.low) / 2
         with np.errstate(divide="ignore"):
             room = half / np.abs(v).max(0), self._rms / np.sqrt((v**2).mean(0))
@@ -252,8 +256,8 @@ class _Kind:
                 levels = np.sign(levels) * np.abs(levels) ** self.tail
                 columns.append(np.repeat(levels / np.abs(levels).max(), hold)[:T])
                 continue
-            lines = np.arange(max(1, round(self.low * T)), max(1, round(self.high * T)) + 1)
-            lines = lines[lines < T / 2]
+            first, last = np.clip([round(self.low * T), round(self.high * T)], 1, (T - 1) // 2)
+            lines = np.arange(first, last + 1)
             drawn = multisine(T, lines=lines, realisations=DRAWS, seed=rng).u[:, :, 0]
             best = drawn[np.argmin(np.abs(drawn).max(1))]
             columns.append(best / np.abs(best).max())
@@ -264,10 +268,11 @@ class _Kind:
 def _pairs(name: str, given: Any, count: int) -> Float[Array, "n 2"]:
     """(least, largest) of each channel."""
     found = reals(f"limits of {name}", given)
-    if found.shape not in ((2,), (count, 2)) or not (found[..., 0] < found[..., 1]).all():
+    ordered = found.shape in ((2,), (count, 2)) and (found[..., 0] < found[..., 1]).all()
+    if not (ordered and np.isfinite(found).all()):
         raise InputError(
-            f"limits of {name} are {given}; give (least, largest), or a list with such a pair for "
-            f"each of the {count} channel(s)."
+            f"limits of {name} are {given}; give finite (least, largest), least below largest, or "
+            f"a list with such a pair for each of the {count} channel(s)."
         )
     return np.broadcast_to(found, (count, 2))
 
@@ -342,12 +347,14 @@ def _errors(
     """Standard errors of each group of parameters, rms, with the old information and the new."""
     values, V = np.linalg.eigh(new)
     V = V[:, values > _TOLD * values[-1]]
-    named = model.lfr.cell.named_parameters()
-    sizes = {name: p.numel() for name, p in named if p.numel() and p.requires_grad}
+    own = model if model.K is None else model.predictor()
+    whole = {n: p.numel() for n, p in own.lfr.cell.named_parameters() if p.requires_grad}
+    parts = zip(whole, free_entries(own).split([*whole.values()]), strict=True)
+    sizes = {name: count for name, mask in parts if (count := int(mask.sum()))}
     found: list[dict[str, float]] = []
     for G in (old, new):
         inverse = np.linalg.pinv(V.T @ G @ V, rcond=1e-13, hermitian=True)
         variance = np.einsum("ik,kl,il->i", V, inverse, V)
-        parts = np.split(variance, np.cumsum([*sizes.values()])[:-1])
-        found.append({n: float(np.sqrt(v.mean())) for n, v in zip(sizes, parts, strict=True)})
+        each = np.split(variance, np.cumsum([*sizes.values()])[:-1])
+        found.append({n: float(np.sqrt(v.mean())) for n, v in zip(sizes, each, strict=True)})
     return found[0], found[1]

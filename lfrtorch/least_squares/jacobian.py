@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lfrtorch.least_squares.gauge import Reduction
@@ -142,14 +142,14 @@ class Jacobian:
         whole[states.place] = torch.einsum("rij,ri->rj", states.Vh, states.s * states.r)
         return system, whole
 
-    def triangle(self) -> Float[Tensor, "K P"]:
-        """R with RᵀR = JᵀJ, without penalties, for a Jacobian that keeps all columns."""
+    def triangle(self, columns: Int[Tensor, " K"]) -> Float[Tensor, "m K"]:
+        """R with RᵀR = JᵀJ in some columns, in rising order, without penalties."""
         total = QRAccumulator()
         for part in self.parts:
             if not isinstance(part, PenaltyRows):
-                part.fold(self._reduced.kept, total, 0)
+                part.fold(columns, total, 0)
         self._complete(total)
-        return self._project(total.R[:, :-1])
+        return total.R[:, :-1]
 
     def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """J dθ."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """The information matrix RᵀR = JᵀJ / σ² of the free parameters θ, at one θ.
+    """The information matrix RᵀR = JᵀJ / σ² of the parameters θ that a fit does not hold, at one θ.
 
     Args:
         theta: θ at which it was computed; a model with other parameters has no use for it.
@@ -19,10 +19,10 @@ class Information:
         samples: number of samples and outputs of these data, weighted.
 
     Shape:
-        theta: (P,), R: (K, P), K <= P.
+        theta: (P,), with the held entries; R: (K, free), K <= free <= P.
     """
 
     theta: Float[Tensor, " P"]
-    R: Float[Tensor, "K P"]
+    R: Float[Tensor, "K free"]
     rmse: float
     samples: float

@@ -59,6 +59,7 @@ def test_limits_are_kept(first):
     limits = {"u": (0.1, 0.9), "du": 0.2, "y": (low, high), "rms": 0.3}
     u = next_experiment(model, record, limits=limits, samples=300).record.u
     assert len(u) == 300
+    assert abs(u[0, 0] - 0.5) <= 0.2  # it begins at rest in the middle
     assert u.min() >= 0.1 - 1e-12
     assert u.max() <= 0.9 + 1e-12
     assert np.abs(np.diff(u, axis=0)).max() <= 0.2 + 1e-12
@@ -69,6 +70,12 @@ def test_limits_are_kept(first):
     wide = next_experiment(model, record).record  # no limits: those of the data
     assert wide.samples == record.samples
     assert wide.u.min() >= record.u.min() - 1e-12
+
+
+def test_short_experiments(first):
+    for samples in range(32, 50, 5):  # stretches of few samples have few lines
+        found = next_experiment(*first, samples=samples, seed=samples)
+        assert found.record.samples == samples
 
 
 def test_several_channels_are_written_for_a_generator(tmp_path: Path):
