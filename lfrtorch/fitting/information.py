@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lfrtorch.data.records import Record, as_records, with_past_outputs
+from lfrtorch.engine.record_starts import STARTS
 from lfrtorch.fitting.windows import windows
 from lfrtorch.least_squares.linear_systems import QRAccumulator
 from lfrtorch.least_squares.problem import Problem
@@ -56,8 +57,8 @@ def information_rows(
     """θ, R with RᵀR = JᵀJ in its free entries, without start states, rms and number of errors."""
     total, squares, size, theta = QRAccumulator(), 0.0, 0, torch.zeros(0)
     free = torch.nonzero(free_entries(model)).squeeze(1)
-    for record in records:
-        problem = Problem.of(model, [record])
+    for batch in _batches(records, len(free), model.lfr.cell.nx):
+        problem = Problem.of(model, batch)
         point, own = problem.evaluate(problem.theta), problem.errors.parameters.own
         theta = point.theta[:own]
         columns = torch.cat([free, torch.arange(own, len(point.theta))])
@@ -66,3 +67,14 @@ def information_rows(
         total.fold(torch.linalg.qr(J.roll(states, 1), mode="r").R[states:, states:])
         squares, size = squares + point.cost, size + problem.size
     return theta, total.R, math.sqrt(squares / size), size
+
+
+def _batches(records: Sequence[Record], free: int, nx: int) -> Iterator[Sequence[Record]]:
+    """Records that are linearised together: with about as many start states as parameters."""
+    others = [record for record in records if not STARTS[record.start].fitted]
+    if others:
+        yield others
+    estimated = [record for record in records if STARTS[record.start].fitted]
+    count = max(1, free // max(nx, 1))
+    for first in range(0, len(estimated), count):
+        yield estimated[first : first + count]
