@@ -1,6 +1,6 @@
 """The next experiment beside a flat multisine of the same rms, on two simulated plants.
 
-    python benchmarks/next_experiment.py [--runs 10] [--only saturation hysteresis]
+    python benchmarks/next_experiment.py [--runs 10] [--only saturation hysteresis] [--show]
 
 saturation   a resonance at 5 Hz behind an amplifier that saturates, at 100 Hz
 hysteresis   a Bouc-Wen system, at 750 Hz, as in benchmarks/update.py
@@ -29,6 +29,7 @@ from lfrtorch import LevenbergMarquardt, Model, Record
 
 Array = NDArray[np.float64]
 FIRST, NEXT = 1000, 1000
+SHOWN: list[bool] = []  # whether each experiment is printed
 PEAK = 3.5  # largest input over its rms
 
 
@@ -92,6 +93,8 @@ def run(plant: Plant, seed: int) -> list[float]:
     model = plant.fitted([first])
     limits = {"u": (-PEAK * plant.rms, PEAK * plant.rms), "rms": plant.rms}
     designed = lfrtorch.next_experiment(model, first, limits=limits, samples=NEXT, seed=seed)
+    if SHOWN:
+        print(designed)
     inputs = [designed.record.u[:, 0], *(plant.flat(n * NEXT, 100 + seed) for n in (1, 2))]
     models = [plant.again(model, [first, plant.record(u, 200 + seed, "next")]) for u in inputs]
 
@@ -106,7 +109,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).split("\n", maxsplit=1)[0])
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--only", nargs="*", default=["saturation", "hysteresis"])
+    parser.add_argument("--show", action="store_true", help="print each experiment")
     given = parser.parse_args()
+    SHOWN.extend([True] * given.show)
     torch.set_num_threads(2)
     for name in given.only:
         plant = Plant(name)

@@ -1,6 +1,6 @@
 """Updates of a model with few data of a changed system, beside a fit to all of its data.
 
-    python benchmarks/update.py [--root DIR] [--only hysteresis motor f16 pieces silence]
+    python benchmarks/update.py [--root DIR] [--only hysteresis motor f16 pieces silence] [--show]
 
 hysteresis   a Bouc-Wen system at 750 Hz, then another whose stiffness and hysteretic force are 20 %
              larger; noise of 8 µm; five multisines of 8192 samples of each
@@ -34,6 +34,7 @@ import lfrtorch
 from lfrtorch import LevenbergMarquardt, Model, Record
 
 PART = 0.05
+SHOWN: list[bool] = []  # whether each update is printed
 Array = NDArray[np.float64]
 
 
@@ -110,6 +111,8 @@ def pair(
         result = lfrtorch.update(old, part)
         seconds = time.perf_counter() - clock
         after = error(result.model, new_tests)
+        if SHOWN:
+            print(result)
         kept = error(result.model, old_tests) / error(old, old_tests)
         print(
             f"{name:12} {before:.4g} -> {after:.4g}, all data {full:.4g}: ratio {after / full:.3f};"
@@ -192,7 +195,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).split("\n", maxsplit=1)[0])
     parser.add_argument("--root", help="folder of the benchmarks' files, for f16")
     parser.add_argument("--only", nargs="*", default=[*CASES, "f16"])
+    parser.add_argument("--show", action="store_true", help="print each update")
     given = parser.parse_args()
+    SHOWN.extend([True] * given.show)
     torch.set_num_threads(2)
     for name in given.only:
         if name in CASES:

@@ -78,9 +78,7 @@ def chosen_by_data(words: Sequence[str]) -> list[str]:
     pairs = [word.lstrip("+").partition("=") for word in words]
     given = {name: value for name, _, value in pairs}
     names = {name.split(".")[0] for name in given}
-    if (
-        "update" in names and given.get("data") == "file"
-    ):  # all new data are fitted, but those of the test
+    if "update" in names and given.get("data") == "file":  # all but the test are fitted
         return [] if "data.validation" in given else ["data.validation=0"]
     if given.get("data") != "file" or not names.isdisjoint({"bench", "resume", "init_from"}):
         return []

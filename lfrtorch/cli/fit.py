@@ -26,6 +26,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from lfrtorch._support.atomic import whole_file
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import Reason
 from lfrtorch.cli import sweep
 from lfrtorch.cli.checks import check_plain
@@ -65,6 +66,8 @@ def run(cfg: DictConfig, folder: Path, command: str = "") -> float:
     first = current().rank == 0
     cfg = chosen_before(cfg, folder)
     if cfg["update"] is not None:  # cfg.update is a method of a mapping
+        if current().world > 1:
+            raise InputError("an update is the work of one process; start it without torchrun.")
         check_plain(cfg)
         limit_threads(cfg)
         return updated(cfg, loaded(cfg), folder)

@@ -66,7 +66,7 @@ def information_rows(
         states = len(columns) - len(free)  # first, so that all rows but theirs are without them
         total.fold(torch.linalg.qr(J.roll(states, 1), mode="r").R[states:, states:])
         squares, size = squares + point.cost, size + problem.size
-    return theta, total.R, math.sqrt(squares / size), size
+    return theta.cpu(), total.R.cpu(), math.sqrt(squares / size), size
 
 
 def _batches(records: Sequence[Record], free: int, nx: int) -> Iterator[Sequence[Record]]:

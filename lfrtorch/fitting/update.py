@@ -72,7 +72,7 @@ SHORT = 10
 _FIRMER = 100.0
 """Factor on the weight while the new model is unstable at rest."""
 
-_LARGEST = 1e4
+_FIRMEST = 1e4
 """Weight up to which it is raised."""
 
 _SETTLED = 1e-3
@@ -182,7 +182,7 @@ def update(
     data = given if model.K is None else [*map(with_past_outputs, given)]
     weight = own.chosen(data) if weight is None else weight
     found, theta = own.fitted(data, weight)
-    while not _stable(found) and _stable(own.model) and weight < _LARGEST:
+    while not _stable(found) and _stable(own.model) and weight < _FIRMEST:
         weight *= _FIRMER
         found, theta = own.fitted(data, weight)
     known = (one.lfr.cell.map.known for one in (own.model, found))
@@ -209,7 +209,7 @@ class _Search:
         self.trainer = LevenbergMarquardt(max_iter=50) if trainer is None else trainer
         cell = self.model.lfr.cell
         free = [p.detach().double().flatten() for p in cell.parameters() if p.requires_grad]
-        theta, self._free = torch.cat(free), free_entries(self.model)
+        theta, self._free = torch.cat(free).cpu(), free_entries(self.model)
         if len(theta) > LARGEST:
             raise InputError(
                 f"the model has {len(theta)} parameters, with those that are held; an update takes "
@@ -252,13 +252,13 @@ class _Search:
         problem.weigh(torch.cat([R, ridge * torch.eye(P).to(R), self._gauge(R, data)]))
         begin = problem.theta
         if theta is not None:
-            begin = torch.cat([theta, begin[len(theta) :]])
+            begin = torch.cat([theta.to(begin), begin[len(theta) :]])
         search = Search(problem, self.trainer)
         search.begin(begin)
         until = self.trainer.limit if limit is None else min(limit, self.trainer.limit)
         search.advance(until, settled=0.0 if limit is None else _SETTLED)
         problem.write(search.state.theta)
-        return model, problem.errors.parameters.read(model.lfr.cell)
+        return model, problem.errors.parameters.read(model.lfr.cell).cpu()
 
     def _gauge(self, R: Float[Tensor, "K P"], records: Sequence[Record]) -> Float[Tensor, "n P"]:
         """Rows that hold the gauge directions, as firmly as the data held what they told best."""

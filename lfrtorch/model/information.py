@@ -14,7 +14,7 @@ class Information:
 
     Args:
         theta: θ at which it was computed; a model with other parameters has no use for it.
-        R: root of the matrix, in float32.
+        R: root of the matrix.
         rmse: σ, the rms of the normalised errors over these data.
         samples: number of samples and outputs of these data, weighted.
 

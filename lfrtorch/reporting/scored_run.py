@@ -44,7 +44,8 @@ def scored_run(job: Job) -> Run:
     samples = sum(record.samples for record in dataset.train)
     fitted_to = f"{dataset.name}: {len(dataset.train)} record(s), {samples} samples"
     model = replace(result.model, fitted_to=fitted_to).reaching(dataset.train)
-    model = informed(model, dataset.train, settings.horizon)
+    if again is None:
+        model = informed(model, dataset.train, settings.horizon)
     result = replace(result, model=model)
     if again is not None:
         fitted_to += " and all other estimation records"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from importlib import import_module
@@ -109,13 +108,6 @@ np.save("y.npy", y[6].numpy())
 """
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
     check(torch.tensor(np.load(tmp_path / "y.npy")), model, u, np.zeros(4))
-    assert json.loads(json.dumps(script_channels(paths[0])))["fs"] == model.fs
-
-
-def script_channels(path: Path) -> dict[str, Any]:
-    about = {"channels.json": ""}
-    torch.jit.load(str(path), _extra_files=about)
-    return json.loads(about["channels.json"])
 
 
 def test_a_map_that_branches_is_refused():
