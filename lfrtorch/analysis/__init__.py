@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from lfrtorch.analysis.canonical_form import Canonical, canonical
 from lfrtorch.analysis.confidence_bands import Band, Uncertainty, spread, uncertainty
+from lfrtorch.analysis.dead_times import DeadTime, dead_times
 from lfrtorch.analysis.linear_bands import PoleBand, ResponseBand, pole_bands, response_band
 from lfrtorch.analysis.linearisation import linearise
 from lfrtorch.analysis.lpv_form import LPV, lpv
@@ -24,6 +25,7 @@ __all__ = [
     "Bound",
     "Canonical",
     "Contraction",
+    "DeadTime",
     "PhysicalParameters",
     "PoleBand",
     "Residuals",
@@ -33,6 +35,7 @@ __all__ = [
     "bound",
     "canonical",
     "contraction",
+    "dead_times",
     "linearise",
     "lpv",
     "physical_parameters",

@@ -41,12 +41,12 @@ def start_error(model: Model, record: Record, y_hat: Float[Array, "T ny"]) -> fl
     N, T = record.skip, min(record.samples, LONGEST)
     if record.start != "estimated" or not 0 < N <= LONGEST // 2 or not np.isfinite(y_hat).all():
         return None
-    cell, u = double(model.lfr.cell), torch.as_tensor(model.scaler.normalise_u(record.u))
+    cell, u = double(model.lfr.cell), torch.as_tensor(model.scaler.normalise(record).u)
     F, H = linearise(cell, model.signals(record).z[:, :T].double())
     moments, axes = np.linalg.eigh(state_moments(cell, u.unsqueeze(0)))
     root = torch.from_numpy(axes * np.sqrt(np.maximum(moments, 0.0))[:, None])
     free = (H @ linear_recurrence(F, torch.zeros_like(F), root)[:, :-1])[0].numpy()
-    weight, scale = record.start_factors[:N], model.scaler.y_scale
+    weight, scale = model.scaler.normalise(record).record.start_factors[:N], model.scaler.y_scale
     errors = np.sqrt(record.weight) / scale * record.errors(y_hat)
     S = (weight[:, :, None] * free[:N]).reshape(N * free.shape[1], -1)
     variance = np.mean(errors**2) + np.finfo(float).tiny

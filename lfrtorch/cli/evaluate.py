@@ -41,7 +41,7 @@ def evaluate(cfg: DictConfig) -> None:
     model, bla = lfrtorch.load(folder), linear_beside(folder)
     if cfg.data._target_ == _FILES:
         from_files(cfg, model, command)
-    dataset = loaded(cfg).with_windows()
+    dataset = loaded(cfg).with_windows(model.delay)
     for record in (*dataset.tests, *dataset.validation, *dataset.selection):
         check_channels(model, record)
     if bla is None and model.sizes["nz"]:

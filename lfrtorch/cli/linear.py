@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -18,11 +19,14 @@ import lfrtorch
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines
+from lfrtorch.analysis.dead_times import dead_times
 from lfrtorch.cli.config import configured, limit_threads, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.cli.run_folder import CONFIG, no_empty_folder, program
+from lfrtorch.fitting.acting_inputs import acting
 from lfrtorch.fitting.linear_start import linear_model, linear_records
+from lfrtorch.fitting.stage import Job
 from lfrtorch.linear.requirements import of_response
 from lfrtorch.reporting import linear_report, plots
 from lfrtorch.reporting.console import Console
@@ -33,11 +37,14 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     """Make one run, and write its files into ``folder``."""
     settings = configured(cfg)
     limit_threads(cfg)
-    dataset = loaded(cfg).with_windows()
-    print(f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples")
+    given, terminal = loaded(cfg), Console()
+    print(f"{given.name}: {sum(r.samples for r in given.train)} training samples")
+    job = acting(
+        Job(given=given, dataset=given.with_windows(), settings=settings, observer=terminal)
+    )
+    dataset = job.dataset
     frf, notes = response(cfg, dataset.train)
     # A fit to the response uses the response that the figures show.
-    terminal = Console()
     data = frf if frf and wants_response(cfg, dataset.train) else None
     data = data or linear_records(dataset.train, settings, terminal)
     model, scan = linear_model(data, settings, dataset.validation, observer=terminal)
@@ -54,7 +61,9 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
         "command": command,
     }
     print(f"\n{in_lines(found['verdict']['text'])}\n\n{linear_report.table(found, evaluation)}")
-    model.save(folder / "linear")
+    for time in dead_times(replace(model, delay=job.delay)) if job.delay else ():
+        print(f"\ndead time of {time}")
+    replace(model, delay=job.delay).save(folder / "linear")
     text = json.dumps(found, indent=2, allow_nan=False)
     with whole_file(folder / "linear.json") as fresh:
         fresh.write_text(text + "\n")

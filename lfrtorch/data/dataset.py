@@ -125,10 +125,12 @@ class Dataset:
                 )
             object.__setattr__(self, use, records)
 
-    def with_windows(self) -> Dataset:
-        """Set the scored samples of estimated starts that do not give them."""
+    def with_windows(self, delay: Sequence[int] = ()) -> Dataset:
+        """Set the scored samples of estimated starts that do not give them, after a delay of u."""
+        later = max(delay, default=0)
         held_out = ("validation", "selection", "tests")
-        return replace(self, **{use: [*map(with_window, getattr(self, use))] for use in held_out})
+        windows = {use: [with_window(r, later) for r in getattr(self, use)] for use in held_out}
+        return replace(self, **windows)
 
     def score_of(self, record: Record) -> str:
         """Name of the score to which a record belongs: its group's, or its own."""

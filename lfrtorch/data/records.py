@@ -460,6 +460,24 @@ class Record:
             period=period, **others,
         )  # fmt: skip
 
+    def delayed(self, delay: Sequence[int], level: Array, start: Start | None = None) -> Record:
+        """Return the record with each input later by whole samples, and as many samples.
+
+        Inputs before the first sample are at their ``level`` (nu,) for a start at rest, repeat in
+        steady state, and equal the first one otherwise. An estimated start leaves out the outputs
+        that unknown inputs act on. ``start`` replaces that of the record.
+        """
+        start, longest = start or self.start, max(delay, default=0)
+        if not longest:
+            return self
+        u, reference = (
+            None if signal is None else shifted(signal, delay, level, start)
+            for signal in (self.u, self.reference)
+        )
+        known = self.is_valid & (np.arange(len(self.y))[:, None] >= longest)
+        masked = start == "estimated" and known[self.skip :].any(axis=0).all()
+        return replace(self, u=u, reference=reference, valid=known if masked else self.valid)
+
     def mean_period(self) -> Record:
         """Return one period: the mean of all P periods of a record in steady state, with weight P.
 
@@ -508,6 +526,16 @@ class Record:
         """Return the signals in ``window`` by name, for ``with_signals``."""
         several = {name: getattr(self, name) for name in ("u", "y", "reference", "valid")}
         return {name: one if one is None else one[window] for name, one in several.items()}
+
+
+def shifted(u: Array, delay: Sequence[int], level: Array, start: Start) -> Array:
+    """Inputs (T, nu) later by whole samples each; what precedes them depends on the start."""
+    found = u.copy()
+    for j, d in enumerate(delay):
+        found[:, j] = np.roll(u[:, j], d)
+        if start != "periodic":
+            found[:d, j] = level[j] if start == "zero" else u[0, j]
+    return found
 
 
 def interpolated(y: Array, valid: Booleans) -> Array:
@@ -610,6 +638,9 @@ class NormalisedRecord:
 class Scaler:
     """Offsets and scales between physical and normalised signals: (physical - offset) / scale.
 
+    Args:
+        delay: whole samples by which each input of a record acts later; empty for none.
+
     Shape:
         u_offset, u_scale: (nu,), y_offset, y_scale: (ny,); physical units.
 
@@ -625,6 +656,7 @@ class Scaler:
     u_scale: Array
     y_offset: Array
     y_scale: Array
+    delay: tuple[int, ...] = ()
 
     @classmethod
     def of(cls, records: Sequence[Record], *, offset: bool = True) -> Scaler:
@@ -639,8 +671,9 @@ class Scaler:
         u_offset, y_offset = centre(us), centre(ys)
         return cls(u_offset, rms_scale(us, u_offset), y_offset, rms_scale(ys, y_offset))
 
-    def normalise(self, record: Record) -> NormalisedRecord:
-        """Normalise a record in physical units."""
+    def normalise(self, record: Record, start: Start | None = None) -> NormalisedRecord:
+        """Normalise a record in physical units, with its inputs as they act after their delay."""
+        record = record.delayed(self.delay, self.u_offset, start)
         limits = None if record.limits is None else self.normalise_y(np.asarray(record.limits))
         return NormalisedRecord(
             self.normalise_u(record.u), self.normalise_y(record.y), record, limits

@@ -40,11 +40,14 @@ def warm_up(samples: int, settling: int) -> int:
     return settling if 0 < settling <= _LONGEST * samples else round(_WARM_UP * samples)
 
 
-def with_window(record: Record) -> Record:
-    """Return the record as it is scored; a record that skips samples stays as it is."""
+def with_window(record: Record, later: int = 0) -> Record:
+    """Return the record as it is scored; a record that skips samples stays as it is.
+
+    Inputs before the record act on the first ``later`` samples, and the window begins after them.
+    """
     if record.start != "estimated" or record.skip:
         return record
-    return replace(record, skip=score_window(record.samples))
+    return replace(record, skip=min(later + score_window(record.samples), record.samples - 1))
 
 
 def fitted(record: Record) -> Record:

@@ -48,6 +48,12 @@ def levels(channels: Sequence[Channel], offset: Array, scale: Array | None = Non
     return ", ".join(said + ["..."] * (len(channels) > _LISTED))
 
 
+def delays(channels: Sequence[Channel], delay: Sequence[int]) -> str:
+    """Delay of each input in samples; empty if there is none."""
+    pairs = zip(channels, delay, strict=True) if any(delay) else ()
+    return ", ".join(f"{channel.name} {d} sample{'s' * (d != 1)}" for channel, d in pairs)
+
+
 def in_columns(facts: Sequence[tuple[str, str | None]]) -> list[str]:
     """Lines of names with their texts; names without a text are left out."""
     width = max(len(name) for name, _ in facts)
@@ -61,6 +67,7 @@ def linear_text(model: Any) -> str:
         ("sampled at", f"{model.fs:g} Hz"),
         ("inputs", levels(model.inputs, model.u_offset)),
         ("outputs", levels(model.outputs, model.y_offset)),
+        ("delay", delays(model.inputs, model.delay)),
         ("order", f"{model.nx}"),
         ("outside of the data", model.outside),
         ("fit", fit and f"{fit.criterion} error {number(fit.rmse)} (normalised), {fit.reason}"),

@@ -170,7 +170,7 @@ def equations(
 ) -> Equations:
     """The equations of a model; ``own`` writes a static map of nz inputs without own equations."""
     check_name(name)
-    model = model.to_model()
+    model = model.to_model().with_delay_line()
     cell, s = double(model.lfr.cell), model.scaler
     written = cell.map.written
     if written is None and cell.static is not None:
@@ -228,8 +228,10 @@ def observer_equations(model: Model | LinearModel, observer: bool | NoiseCovaria
     """Gain or noise of an observer."""
     if observer is False:
         return Observer({}, {})
-    model = model.to_model()
+    nx, model = model.to_model().lfr.cell.nx, model.to_model().with_delay_line()
     if isinstance(observer, NoiseCovariance):
+        line = np.zeros(model.lfr.cell.nx - nx)
+        observer = observer.extended(line, nx) if len(line) else observer
         cell, ny = model.lfr.cell, model.lfr.cell.ny
         G, U = observer.root(cell.nx, ny), data_root(cell)
         joint = G @ G.T

@@ -64,6 +64,12 @@ class PlainSettings:
         "whether the input acts on the output at once, also in the linear model. Give False for "
         "data from a feedback loop without a delay.",
     )
+    delay: float | Literal["auto"] | tuple[float, ...] = setting(
+        0,
+        'dead time of the inputs in samples, one number, or one for each input; ``"auto"``: found '
+        "by linear models. Inputs act later by whole samples, rounded up; the fit finds the "
+        "fraction, see :func:`lfrtorch.analysis.dead_times`.",
+    )
     structure: Literal["free", "wiener", "hammerstein", "wiener_hammerstein", "parallel"] = setting(
         "free",
         'block structure of the model, which a fit keeps: ``"wiener"``, ``"hammerstein"``, '

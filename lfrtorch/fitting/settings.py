@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from inspect import signature
 from typing import Any, Literal, cast
@@ -12,7 +12,7 @@ import torch
 from torch.nn import Module
 
 from lfrtorch._support.arguments import typed
-from lfrtorch._support.checks import integer
+from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.settings import check_settings, documented, setting
 from lfrtorch.engine.cell import check_dtype
@@ -133,6 +133,7 @@ class Settings(PlainSettings):
             object.__setattr__(self, "linear", {**self.linear, "refine": refine})
         if not self.feedthrough:
             object.__setattr__(self, "linear", {**self.linear, "feedthrough": False})
+        self._take_delay()
         known = [*signature(estimate_bla).parameters][2:]
         for name in self.linear:
             if name not in known:
@@ -167,6 +168,17 @@ class Settings(PlainSettings):
                 driven = self.relaxations + 2 * self.modes
                 of_linear = (size - driven) // (1 + (self.structure in IN_SERIES))
                 object.__setattr__(self, f"n{axis}", of_linear if axis == "x" else size)
+
+    def _take_delay(self) -> None:
+        """Refuse delays that are no numbers; several become a tuple."""
+        given: Any = self.delay
+        if isinstance(given, str) and given == "auto":
+            return
+        several = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str)
+        for one in given if several else [given]:
+            number("delay", one, word="auto")
+        if several:
+            object.__setattr__(self, "delay", tuple(given))
 
     def _check_known(self) -> None:
         """Refuse settings that a known model cannot have."""
@@ -254,6 +266,7 @@ class Settings(PlainSettings):
         """Sizes, ridge, starts and iterations by name, with the numbers that were chosen."""
         names = ("ridge", "starts", "average", "seed")
         numbers = {name: getattr(self, name) for name in names}
+        numbers |= {"delay": self.delay} if self.delay != 0 else {}
         if isinstance(self.ridge, Mapping):
             numbers["ridge"] = dict(self.ridge)
         return {**self.sizes, **numbers, "max_iter": self.trainer.limit}

@@ -48,8 +48,10 @@ class Job:
     """The state of an identification; its settings include the values chosen so far.
 
     Args:
-        given: records by use, as they were given.
+        given: records by use, with their inputs as they act.
         dataset: the same records, with their score windows.
+        delay: whole samples by which each input acts later; empty for none.
+        whole: the dataset as it was measured, if the inputs are delayed.
         settings, observer, stop, snapshots: see :func:`lfrtorch.identify`.
         linear: the best linear approximation.
         begun: the linear approximation that the models are made from; its order may differ.
@@ -63,6 +65,8 @@ class Job:
     dataset: Dataset
     settings: Settings
     observer: Observer
+    delay: tuple[int, ...] = ()
+    whole: Dataset | None = None
     stop: Stop | None = None
     snapshots: Snapshots | None = None
     linear: LinearModel = _LATER

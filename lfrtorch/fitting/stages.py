@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from lfrtorch.fitting.acting_inputs import ActingInputs
 from lfrtorch.fitting.first_fit import FirstPart
 from lfrtorch.fitting.from_outputs import PARTS, MeasuredStates, ShortWindows
 from lfrtorch.fitting.given_entries import GivenEntries
@@ -14,6 +15,7 @@ from lfrtorch.fitting.start_models import FromLinear, FromModel
 from lfrtorch.fitting.whole_fit import WholeFit
 
 STAGES: tuple[Stage, ...] = (
+    ActingInputs(),
     OutputsAsStates(),
     BestLinear(),
     Sizes(),

@@ -165,6 +165,7 @@ def initialise(
         rms_scale([r.u for r in data], bla.u_offset),
         bla.y_offset,
         rms_scale([r.y for r in data], bla.y_offset),
+        bla.delay,
     )
     sizes = len(bla.inputs), len(bla.outputs), len(bla.A)
     generator = torch.Generator().manual_seed(int(seed))
@@ -195,7 +196,7 @@ def initialise(
     with torch.no_grad():
         found = [response.signals(record) for record in data]
         x = torch.cat([trajectory.x[0, :-1] for trajectory in found])
-        u = torch.cat([torch.as_tensor(scaler.normalise_u(r.u)).to(x) for r in data])
+        u = torch.cat([torch.as_tensor(scaler.normalise(r).u).to(x) for r in data])
         std = _deviation(x)
         if not (x.abs() < _RUNAWAY).all():
             raise InputError(

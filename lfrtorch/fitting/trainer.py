@@ -29,6 +29,7 @@ from lfrtorch.least_squares.residual import Point
 from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.least_squares.search import Search
 from lfrtorch.least_squares.shared_problem import problem_of
+from lfrtorch.linear.delay_search import delayed_records
 from lfrtorch.model.model import Model
 
 EXPLOSION = 100.0
@@ -193,14 +194,15 @@ class Fit:
     ) -> None:
         self.model, self.keep, self._stop = model, keep, stop
         self.trainer = LevenbergMarquardt() if trainer is None else trainer
-        longest = max(record.samples for record in as_records(train))
+        acting = partial(delayed_records, delay=model.delay, level=model.scaler.u_offset)
+        train, validation = acting(as_records(train)), acting(validation and as_records(validation))
+        model = model.delayed(0) if any(model.delay) else model
+        longest = max(record.samples for record in train)
         guarantee = partial(guarantee_of, self.trainer.guarantee, longest)
         if horizon is not None:
             nx = model.lfr.cell.nx
             cut = partial(windows, horizon=horizon, nx=nx, y_scale=model.scaler.y_scale)
-            train = cut(as_records(train))
-            if validation:
-                validation = cut(as_records(validation), fitted=False)
+            train, validation = cut(train), cut(validation, fitted=False)
         self.problem = problem_of(model, train, ridge=ridge, guarantee=guarantee)
         self.judge = Problem.judge(model, validation) if validation else None
         self.at: FitState | None = None

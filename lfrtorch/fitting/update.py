@@ -54,6 +54,7 @@ from lfrtorch.least_squares.guarantee import guarantee_of
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.search import Search
+from lfrtorch.linear.delay_search import delayed_records
 from lfrtorch.model.information import Information
 from lfrtorch.model.model import Model
 
@@ -178,6 +179,12 @@ def update(
     given = as_records(records)
     for record in given:
         model.check(record)
+    if any(delay := model.delay):
+        acting = partial(delayed_records, delay=delay, level=model.scaler.u_offset)
+        prior = None if prior is None else acting(as_records(prior))
+        told = {"prior": prior, "weight": weight, "horizon": horizon, "trainer": trainer}
+        found = update(model.delayed(0), acting(given), **told)
+        return replace(found, model=found.model.delayed(delay))
     own = _Search(model if prior is None else informed(model, prior, horizon), horizon, trainer)
     data = given if model.K is None else [*map(with_past_outputs, given)]
     weight = own.chosen(data) if weight is None else weight

@@ -84,6 +84,7 @@ class LinearModel:
         fit: record of the fit.
         x_offset: for a linearised nonlinear model, the state of that model at x = 0.
         outside: parts of that state and of its input that the data did not reach, in words.
+        delay: whole samples by which each input acts later; the states do not include them.
 
     Example:
         >>> bla
@@ -112,6 +113,7 @@ class LinearModel:
     fit: LinearFit | None = None
     x_offset: Float[Array, " nx"] | None = None
     outside: str = ""
+    delay: tuple[int, ...] = ()
 
     @classmethod
     def of(cls, model: Model, system: StateSpace | None = None, **about: Any) -> Self:
@@ -120,11 +122,13 @@ class LinearModel:
         K = None if model.K is None else model.K.double().cpu().numpy() / s.y_scale
         known: dict[str, Any] = {"u_offset": s.u_offset, "y_offset": s.y_offset, "K": K}
         known |= {"inputs": model.inputs, "outputs": model.outputs, "fs": model.fs}
+        known |= {"delay": s.delay}
         return cls(*own.physical(s), **known | about)
 
     def __repr__(self) -> str:
         signals = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        return f"LinearModel({signals}, {self.fs:g} Hz, nx={self.nx})"
+        delay = f", delay={list(self.delay)}" * any(self.delay)
+        return f"LinearModel({signals}, {self.fs:g} Hz, nx={self.nx}{delay})"
 
     def __str__(self) -> str:
         return linear_text(self)
@@ -147,7 +151,8 @@ class LinearModel:
     def frf(self, frequencies: ArrayLike) -> Complex:
         """Frequency response C (zI - A)⁻¹ B + D, (F, ny, nu), at frequencies (F,) in Hz."""
         z = unit_circle(frequencies, self.fs)
-        return frequency_response(self.A, self.B, self.C, self.D, z)
+        G = frequency_response(self.A, self.B, self.C, self.D, z)
+        return G * z[:, None, None] ** -np.array(self.delay) if self.delay else G
 
     def frf_std(self, frequencies: ArrayLike) -> Array:
         """Standard deviation (F, ny, nu) of ``frf``, from the covariance of the parameters."""
@@ -156,7 +161,11 @@ class LinearModel:
     def frf_covariance(self, frequencies: ArrayLike) -> Array:
         """Covariance of the real and imaginary part of ``frf``, (F, ny, nu, 2, 2)."""
         z = unit_circle(frequencies, self.fs)
-        return response_covariance(self.A, self.B, self.C, self.covariance, z)
+        found = response_covariance(self.A, self.B, self.C, self.covariance, z)
+        turn = (z[:, None] ** -np.array(self.delay or (0,)))[:, None]
+        turns = np.stack([turn.real, -turn.imag, turn.imag, turn.real], -1)
+        R = turns.reshape(*turn.shape, 2, 2)
+        return R @ found @ R.swapaxes(-1, -2) if self.delay else found
 
     def simulate(self, data: Record | ArrayLike) -> Array:
         """Simulated output (T, ny), see ``Model.simulate``; it does not use a record's x0."""
@@ -202,19 +211,24 @@ class LinearModel:
     def to_model(self, y_scale: Array | None = None) -> Model:
         """The same as a ``Model``, in the same coordinates; ``y_scale`` is 1 by default."""
         y_scale = np.ones(len(self.C)) if y_scale is None else y_scale
-        unit = Scaler(self.u_offset, np.ones(self.B.shape[1]), self.y_offset, y_scale)
+        unit = Scaler(self.u_offset, np.ones(self.B.shape[1]), self.y_offset, y_scale, self.delay)
         cell = LFRCell(self.B.shape[1], len(self.C), self.nx, dtype=torch.float64, random=False)
         self.write(cell, unit)
         K = None if self.K is None else torch.as_tensor(self.K * y_scale)
         return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs, K=K)
 
+    def with_delay_line(self) -> LinearModel:
+        """The same system with its delays as states, see ``Model.with_delay_line``."""
+        return LinearModel.of(self.to_model().with_delay_line()) if any(self.delay) else self
+
     def to_scipy(self) -> scipy.signal.StateSpace:
         """The deviations from the operating point as a ``scipy.signal.StateSpace``."""
-        return scipy.signal.StateSpace(self.A, self.B, self.C, self.D, dt=1.0 / self.fs)
+        own = self.with_delay_line()
+        return scipy.signal.StateSpace(own.A, own.B, own.C, own.D, dt=1.0 / self.fs)
 
     def to_control(self) -> Any:
         """The same as a ``control.StateSpace``; a ValueError if python-control is missing."""
-        return control_system(self)
+        return control_system(self.with_delay_line())
 
     def save(self, folder: str | Path) -> Path:
         """Write a checkpoint folder as a model does, with the fit and its covariances."""

@@ -56,7 +56,10 @@ def _made(description: dict[str, Any], weights: dict[str, Tensor], maker: MapMak
     lost = [n for n, w in weights.items() if not n.endswith(".bounds") and not w.isfinite().all()]
     if lost:
         raise InputError(f"{', '.join(lost)} have numbers that are not finite")
-    scaler = Scaler(*(weights.pop(f"scaler.{name}").numpy() for name in SCALING))
+    scaling = {name: weights.pop(f"scaler.{name}").numpy() for name in SCALING}
+    scaler = Scaler(**scaling, delay=tuple(map(int, description.get("delay", ()))))
+    if scaler.delay and (len(scaler.delay) != sizes["nu"] or min(scaler.delay) < 0):
+        raise InputError(f"delay is {scaler.delay}")
     if weights["A"].shape != (sizes["nx"],) * 2:
         raise InputError("they are of other sizes")
     static = maker(description["static"], sizes["nz"], sizes["nw"], dtype)

@@ -86,6 +86,14 @@ class NoiseCovariance:
             )
         return np.block([[Gy, np.zeros((ny, nx))], [across, own]])
 
+    def extended(self, more: Float[Array, " m"], nx: int) -> NoiseCovariance:
+        """The noise of nx states and of further states with these variances."""
+        S = self.S
+        if S is not None:
+            S = reals("S", S)
+            S = np.vstack([S, np.zeros((len(more), *S.shape[1:]))])
+        return NoiseCovariance(with_variances("Q", self.Q, more, nx), self.R, S)
+
 
 @final
 class ExtendedKalmanFilter(StateObserver):

@@ -31,9 +31,11 @@ from lfrtorch.data.records import (
     as_signal,
     check_rate,
     check_start,
+    shifted,
     with_past_outputs,
 )
-from lfrtorch.engine.description import in_columns, levels, listed, system_lines
+from lfrtorch.engine.delay_line import delay_line_cell
+from lfrtorch.engine.description import delays, in_columns, levels, listed, system_lines
 from lfrtorch.engine.disturbance import (
     disturbance_scale,
     disturbed_cell,
@@ -178,6 +180,7 @@ class Model:
     def __repr__(self) -> str:
         sizes = ", ".join(f"{name}={size}" for name, size in self.sizes.items())
         sizes = f"{self.known_states} known states, {sizes}" if self.known_states else sizes
+        sizes += f", delay={list(self.delay)}" * any(self.delay)
         return f"Model({listed(self.inputs)} -> {listed(self.outputs)}, {self.fs:g} Hz, {sizes})"
 
     def __str__(self) -> str:
@@ -199,6 +202,7 @@ class Model:
             ("sampled at", f"{self.fs:g} Hz"),
             ("inputs", levels(self.inputs, scaler.u_offset, scaler.u_scale)),
             ("outputs", levels(self.outputs, scaler.y_offset, scaler.y_scale)),
+            ("delay", delays(self.inputs, self.delay)),
             ("sizes", f"{sizes}; {counts}"),
             ("static map", first.split("\n")[0] if cell.nw else ""),
             *(("beside it", other) for other in others),
@@ -219,6 +223,60 @@ class Model:
         cell, learned = self.lfr.cell, self.lfr.cell.map.learned
         nx = cell.nx - self.known_states
         return {"nx": nx, "nz": learned.nz, "nw": learned.nw, **learned.sizes}
+
+    @property
+    def delay(self) -> tuple[int, ...]:
+        """Whole samples by which each input acts later; the states do not include them.
+
+        The model may know a part of a sample more, see ``lfrtorch.analysis.dead_times``.
+
+        Example:
+            >>> model.delay, model.delayed(3).delay
+            ((0,), (3,))
+        """
+        return self.scaler.delay or (0,) * len(self.inputs)
+
+    def delayed(self, delay: int | Sequence[int]) -> Model:
+        """The model with other delays of its inputs, in whole samples: one number, or one each.
+
+        Example:
+            >>> later = model.delayed(3)
+            >>> np.allclose(later.simulate(record.u)[3:], model.simulate(record.u)[:-3])
+            True
+        """
+        given = delay if isinstance(delay, Sequence) else (delay,) * len(self.inputs)
+        if len(given) != len(self.inputs):
+            raise InputError(
+                f"delay has {len(given)} numbers, and the model {len(self.inputs)} input(s); give "
+                "one for each."
+            )
+        for one in given:
+            integer("delay", one, 0)
+        return replace(self, scaler=replace(self.scaler, delay=tuple(int(d) for d in given)))
+
+    def with_delay_line(self) -> Model:
+        """The same model whose delays are states after its own, the inputs of the last samples.
+
+        The model itself if it has no delay. Observers and exports, which take a sample at a time,
+        are of this model. A model in innovation form keeps its gain K.
+
+        Example:
+            >>> whole = model.delayed(3).with_delay_line()
+            >>> whole.sizes["nx"], whole.delay
+            (4, (0,))
+            >>> np.allclose(whole.simulate(record), model.delayed(3).simulate(record))
+            True
+        """
+        if not any(self.delay):
+            return self
+        whole = LFR(delay_line_cell(self.lfr.cell, self.delay))
+        K = (
+            None
+            if self.K is None
+            else torch.cat([self.K, self.K.new_zeros(sum(self.delay), len(self.outputs))])
+        )
+        scaler = replace(self.scaler, delay=())
+        return replace(self, lfr=whole, scaler=scaler, K=K, information=None)
 
     @property
     def known_states(self) -> int:
@@ -368,9 +426,9 @@ class Model:
         check_start(start, "simulation")
         if start == "given" and x0 is None:
             raise InputError("start='given' needs a start state: pass x0.")
-        like = self.lfr.cell.A
-        v = torch.as_tensor(self.scaler.normalise_u(u)).to(like).unsqueeze(0)
-        state = None
+        like, s = self.lfr.cell.A, self.scaler
+        v = s.normalise_u(shifted(u, s.delay, s.u_offset, start))
+        v, state = torch.as_tensor(v).to(like).unsqueeze(0), None
         if x0 is not None:
             given = reals("x0", x0).ravel()
             if len(given) != self.lfr.cell.nx:
@@ -381,7 +439,7 @@ class Model:
         if start in ("estimated", "measured"):
             if not isinstance(data, Record):
                 raise InputError(f"start='{start}' needs a record, whose y determines the state.")
-            trajectory = simulate_record(self.lfr, self.scaler.normalise(data), start)
+            trajectory = simulate_record(self.lfr, s.normalise(data, start), start)
         else:
             trajectory = self.lfr.trajectory(v, state, start)
         return Trajectory(*(signal.cpu() for signal in trajectory))
@@ -419,7 +477,7 @@ class Model:
             return record.shown(np.concatenate([record.y[:1], first[:-1], later]))
         states = self.predictor().signals(with_past_outputs(record)).x[0, :-1]
         cell, T = self.lfr.cell, record.samples
-        u = torch.as_tensor(self.scaler.normalise_u(record.u)).to(cell.A)
+        u = torch.as_tensor(self.scaler.normalise(record).u).to(cell.A)
         x, y = states.to(cell.A), cell.A.new_empty(T, cell.ny)
         with torch.no_grad():
             for ahead in range(min(horizon, T)):  # x has the states predicted so far
@@ -518,6 +576,8 @@ class Model:
             if x0 is not None:
                 raise InputError("after and x0 both set the initial states; give only one of them.")
             self.check(after)
+        if any(self.delay):
+            return self._observer_of_line(noise, disturbance, after, x0, P0)
         known = self.lfr.cell, self.scaler, self.inputs, self.outputs
         begin = np.zeros(self.lfr.cell.nx) if x0 is None else x0
         if noise is not None:
@@ -545,6 +605,24 @@ class Model:
         if after is not None:
             begin = self.predictor().signals(with_past_outputs(after)).x[0, -1].double().numpy()
         return SteadyGainObserver(*known, begin, self.K)
+
+    def _observer_of_line(
+        self,
+        noise: NoiseCovariance | None,
+        disturbance: Disturbance | None,
+        after: Record | None,
+        x0: ArrayLike | None,
+        P0: ArrayLike | None,
+    ) -> StateObserver:
+        """Observer of the states and of the delay line, whose inputs are known without noise."""
+        whole, nx, line = self.with_delay_line(), self.lfr.cell.nx, np.zeros(sum(self.delay))
+        if x0 is not None:
+            x0 = np.append(reals("x0", x0), line)
+        if noise is None:
+            return whole.observer(after=after, x0=x0)
+        P0 = None if P0 is None else with_variances("P0", P0, line, nx)
+        noise = noise.extended(line, nx)
+        return whole.observer(noise=noise, disturbance=disturbance, after=after, x0=x0, P0=P0)
 
     @typed()
     def with_disturbance(
@@ -584,6 +662,10 @@ class Model:
             >>> observer.state.shape, observer.disturbance.shape
             ((1,), (1,))
         """
+        if any(self.delay):
+            line = np.zeros(sum(self.delay))
+            noise = noise.extended(line, self.lfr.cell.nx)
+            return self.with_delay_line().with_disturbance(at, noise)
         cell, scaler = double(self.lfr.cell), self.scaler
         nu, ny, nx = cell.nu, cell.ny, cell.nx
         E = self._entries(at)
@@ -602,8 +684,7 @@ class Model:
         if np.shape(noise.Q) != (nx + nd, nx + nd):
             moduli = np.abs(np.linalg.eigvals(local.A[:nx, :nx]))
             drift = drift_variance(moduli, disturbance_scale(E, scaler))
-            S = None if noise.S is None else np.vstack([reals("S", noise.S), np.zeros((nd, ny))])
-            noise = NoiseCovariance(with_variances("Q", noise.Q, drift, nx), noise.R, S)
+            noise = noise.extended(drift, nx)
         return replace(self, lfr=LFR(whole), K=None), noise
 
     def resample(self, fs: float) -> Resampled:
@@ -636,6 +717,7 @@ class Model:
         K = static_slope(cell, z[None, None])[0, 0].detach().numpy()
         made = LFR(resampled_cell(cell, K, self.fs / fs))
         other = replace(self, lfr=made, fs=fs, K=None)
+        other = other.delayed([round(one * fs / self.fs) for one in self.delay])
         # Both models simulate the same input, held over the samples of both.
         slow, fast = sorted([fs, self.fs])
         ratio = Fraction(fast / slow).limit_denominator(_COMMON)
@@ -698,7 +780,8 @@ class Model:
         s = self.scaler
         offset = np.concatenate([s.u_offset, s.y_offset])
         scale = np.concatenate([s.u_scale, s.y_scale])
-        scaler = Scaler(offset, scale, s.y_offset, s.y_scale)
+        later = s.delay and (*s.delay, *(0,) * len(self.outputs))
+        scaler = Scaler(offset, scale, s.y_offset, s.y_scale, later)
         cell = predictor_cell(self.lfr.cell, self.K)
         inputs = (*self.inputs, *self.outputs)
         return replace(self, lfr=LFR(cell), scaler=scaler, inputs=inputs, K=None)
@@ -715,7 +798,7 @@ class Model:
         """
         cell, K = split_predictor(self.lfr.cell)
         nu, s = cell.nu, self.scaler
-        scaler = Scaler(s.u_offset[:nu], s.u_scale[:nu], s.y_offset, s.y_scale)
+        scaler = Scaler(s.u_offset[:nu], s.u_scale[:nu], s.y_offset, s.y_scale, s.delay[:nu])
         return replace(self, lfr=LFR(cell), scaler=scaler, inputs=self.inputs[:nu], K=K)
 
     def check(self, record: Record) -> None:
@@ -794,9 +877,15 @@ def simulate_blocks(
     first, state = 0, torch.zeros(1, cell.nx, dtype=torch.float64)
     if x0 is not None:
         state = model.signals(np.zeros((1, cell.nu)), start="given", x0=x0).x[:, 0].double()
+    delay, past = model.delay, None
     for block in blocks:
         u = as_signal(block, model.inputs, "input", first=first)
-        v = torch.as_tensor(scaler.normalise_u(u)).to(like).unsqueeze(0)
+        if past is None:  # as for one simulation
+            past = np.tile(scaler.u_offset if x0 is None else u[0], (max(delay), 1))
+        since = np.concatenate([past, u])
+        past = since[len(u) :]
+        later = [since[len(past) - d :, j][: len(u)] for j, d in enumerate(delay)]
+        v = torch.as_tensor(scaler.normalise_u(np.stack(later, 1))).to(like).unsqueeze(0)
         trajectory = simulate(cell, v.cpu().double(), state)
         y = scaler.restore_y(trajectory.y[0].to(like.dtype).double().numpy())
         lost = ~np.isfinite(y).all(axis=1)
@@ -836,6 +925,7 @@ def write_model(
         "outputs": [c._asdict() for c in model.outputs],
     }
     description |= {"fitted_to": model.fitted_to} if model.fitted_to else {}
+    description |= {"delay": model.delay} if any(model.delay) else {}
     description |= {} if about is None else {"linear": dict(about)}
     weights = dict(cell.state_dict())
     weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in SCALING}

@@ -8,6 +8,7 @@ from typing import Any
 
 from lfrtorch._support.tables import quantity
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
+from lfrtorch.analysis.dead_times import DeadTime
 from lfrtorch.analysis.physical_parameters import PhysicalParameters
 from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.data.dataset import Dataset
@@ -41,6 +42,7 @@ class Run:
         evaluation: both models on every record.
         residuals: analysis of the record with the largest error, as the report shows it.
         parameters: parameters of the known model, if the settings contain a known model.
+        dead_times: dead time of each input; empty if ``settings`` ask for no delay.
         memory: result of the test whether the simulation forgets its start; None if predictions or
             windows were fitted.
         metrics: contents of ``metrics.json``: scores by record, sizes, the fit in numbers.
@@ -67,6 +69,7 @@ class Run:
     evaluation: Evaluation
     residuals: Residuals | None = None
     parameters: PhysicalParameters | None = None
+    dead_times: tuple[DeadTime, ...] = ()
     memory: Memory | None = None
     metrics: Mapping[str, Any] = field(init=False)
     verdict: Verdict
@@ -110,6 +113,8 @@ class Run:
         parts.append(scores.table(self.evaluation, fit.averaged))
         if self.parameters is not None:
             parts.append(f"\n{self.parameters}\n")
+        if self.dead_times:
+            parts.append(f"dead time of {'; '.join(map(str, self.dead_times))}\n")
         if self.metrics["stable_to"] < max(LOUDER):
             parts.append(f"note: {scores.stability(self.metrics['stable_to'])}")
         if self.memory is not None and not self.memory.fades:
@@ -144,6 +149,7 @@ class Run:
                 "train": refit.history[refit.chosen_iteration].train,
             },
             "known": {} if self.parameters is None else self.parameters.entries(),
+            "dead_times": [asdict(one) for one in self.dead_times],
             "residuals": {} if self.residuals is None else self.residuals.entries(),
             "stable_to": largest_stable_amplitude(self.model, dataset.train),
             "memory": self.memory and self.memory._asdict(),

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import cast
 
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.threads import each_alone
-from lfrtorch.analysis.physical_parameters import physical_parameters
+from lfrtorch.analysis.confidence_bands import uncertainty
+from lfrtorch.analysis.dead_times import DeadTime, dead_times
+from lfrtorch.analysis.physical_parameters import PhysicalParameters, physical_parameters
 from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.records import Record
+from lfrtorch.fitting.acting_inputs import with_delay
 from lfrtorch.fitting.forgetting import forgets
 from lfrtorch.fitting.information import informed
 from lfrtorch.fitting.linear_start import linear_records, of_linear_model, tell
@@ -21,6 +27,7 @@ from lfrtorch.fitting.windows import begins_at_outputs, windows
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
+from lfrtorch.model.model import Model
 from lfrtorch.reporting.advice import advise
 from lfrtorch.reporting.diagnosis import evidence
 from lfrtorch.reporting.evaluation import (
@@ -49,16 +56,27 @@ def scored_run(job: Job) -> Run:
     result = replace(result, model=model)
     if again is not None:
         fitted_to += " and all other estimation records"
-        known = [*dataset.train, *dataset.validation, *dataset.selection]
-        told = replace(again.model, fitted_to=fitted_to).reaching(known)
+        told = replace(again.model, fitted_to=fitted_to).reaching(
+            [*dataset.train, *dataset.validation, *dataset.selection]
+        )
         again = replace(again, model=informed(told, estimation_records(dataset), settings.horizon))
+    own = linear_models_of_tests(dataset, settings)
+    seen = dataset.train if again is None else estimation_records(dataset)
+    known = _known_parameters((again or result).model, seen, settings)
+    times = _dead_times((again or result).model, job, seen)
+    if job.whole is not None:  # from here on all records are as they were measured
+        dataset, linear = job.whole, replace(linear, delay=job.delay)
+        result = with_delay(result, job.delay)
+        again = None if again is None else with_delay(again, job.delay)
+        opposed = {ahead: replace(one, delay=job.delay) for ahead, one in opposed.items()}
+        own = {name: replace(one, delay=job.delay) for name, one in own.items()}
     evaluation = Evaluation(
         dataset=dataset,
         linear=opposed[None],
         predictors=opposed,
         model=result.model,
         refitted=None if again is None else again.model,
-        own=linear_models_of_tests(dataset, settings),
+        own=own,
         horizon=settings.horizon,
         left_out=() if choice is None else cross_validated(choice.left_out),
     )
@@ -67,7 +85,7 @@ def scored_run(job: Job) -> Run:
     opponent = opposed[None]
     memory = None
     if settings.noise == "output" and settings.horizon is None:
-        seen = dataset.train if again is None else estimation_records(dataset)
+        seen = dataset.train if again is None else estimation_records(dataset)  # as measured
         memory = forgets((again or result).model, seen, opponent)
     refusals = [REMEMBERS] if memory is not None and not memory.right else []
     if settings.noise == "output" or in_turn:
@@ -90,13 +108,6 @@ def scored_run(job: Job) -> Run:
         verdict=verdict,
         residuals=residuals,
     )
-    known = None
-    if model.known_states:
-        of = dataset.train if again is None else estimation_records(dataset)
-        ridge = 0.0 if isinstance(settings.ridge, Mapping | str) else settings.ridge
-        if begins_at_outputs(of) and settings.horizon is not None:
-            of = windows(of, settings.horizon, model.lfr.cell.nx, y_scale=model.scaler.y_scale)
-        known = physical_parameters((again or result).model, of, ridge=ridge)
     return Run(
         dataset=dataset,
         settings=settings,
@@ -108,10 +119,37 @@ def scored_run(job: Job) -> Run:
         evaluation=evaluation,
         residuals=residuals,
         parameters=known,
+        dead_times=times,
         memory=memory,
         verdict=verdict,
         advice=advise(found),
     )
+
+
+def _known_parameters(
+    model: Model, records: Sequence[Record], settings: Settings
+) -> PhysicalParameters | None:
+    """The parameters of the known model, if there is one."""
+    if not model.known_states:
+        return None
+    ridge = 0.0 if isinstance(settings.ridge, Mapping | str) else settings.ridge
+    if begins_at_outputs(records) and settings.horizon is not None:
+        cut = partial(windows, horizon=settings.horizon, nx=model.lfr.cell.nx)
+        records = cut(records, y_scale=model.scaler.y_scale)
+    return physical_parameters(model, records, ridge=ridge)
+
+
+def _dead_times(model: Model, job: Job, records: Sequence[Record]) -> tuple[DeadTime, ...]:
+    """Dead times of delayed inputs by the model at rest and a linear one with a state more."""
+    if not job.delay:
+        return ()
+    found, own = [job.linear], of_linear_model(job.settings)
+    with suppress(InputError):  # it has a gain K, or no rest
+        found = [uncertainty(model, records).linearise()]
+    if not begins_at_outputs(records):
+        with suppress(InputError):  # too few data for another state
+            found.append(estimate_bla(records, job.linear.nx + 1, **own.linear))
+    return dead_times([replace(one, delay=job.delay) for one in found])
 
 
 def linear_opponents(

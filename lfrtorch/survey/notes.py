@@ -107,8 +107,8 @@ _SENTENCES = {
     "unrelated": "hardly anything of output '{name}' follows from the inputs linearly: wrong "
     "columns, times that do not match, noise, or a purely even nonlinearity.",
     "delay": "a dead time of about {delay} samples{lasting} from input '{input}' to output "
-    "'{output}', after the usual one sample:\nshift the output by it, or a model spends as many "
-    "states on it.",
+    "'{output}', after the usual one sample:\ngive delay='auto', or a model spends as many states "
+    "on it.",
     "drift": "output '{name}' drifts by {drift:.3g} in the record, {ratio:.1f} times its rms, and "
     "no input does: remove it if the sensor drifts; keep it if the system integrates.",
     "lost": "from about sample {sample} on, '{name}' follows the inputs one sample {turn}:\na "

@@ -1,0 +1,159 @@
+"""Delays of the inputs, in whole samples, by the errors of linear models.
+
+A plant that begins to act d samples after its input, 0 < d <= 1 beyond a whole number m - 1, has
+after its sampling with a held input the response of a model of the same order with feedthrough,
+whose input is m samples later. So whole delays are enough: the fraction is in the feedthrough (see
+``lfrtorch.analysis.dead_times``). A smaller delay leaves a model that needs more states, a larger
+one leaves out the beginning of the response.
+
+References:
+    Franklin, Powell and Workman, "Digital Control of Dynamic Systems", 1998, section 4.3.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+
+from lfrtorch._support.errors import InputError
+from lfrtorch.data.records import Record
+from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.linear.order_scan import scan_orders
+from lfrtorch.survey.causality import dead_time, two_sided_response
+
+Delay = tuple[int, ...]
+
+NEAR = 2
+"""Delays at least so far from the best are compared."""
+
+_COARSE = (0, 1, 2, 4, 8, 16, 32, 64)
+"""Delays that are tried first where past inputs do not show one."""
+
+_ORDERS, _ITERATIONS = range(1, 4), 15
+"""Orders among which that of the search is chosen, and iterations for each."""
+
+_LEAST = 2
+"""Least order of the search: one lag with a delay stands for several lags, with a smaller one."""
+
+_LARGEST = 1 / 4
+"""Largest delay, relative to the shortest record."""
+
+_ALIKE = 4.0
+"""Delays are as good as the best if the squared errors, over their variance, add up to so much
+more: two standard deviations of one parameter. The largest of these is taken."""
+
+
+def delayed_records(records: Sequence[Record], delay: Delay, level: Any) -> list[Record]:
+    """Records with their inputs as they act; unknown first inputs are cut off with their outputs.
+
+    Args:
+        records: the records.
+        delay: whole samples of each input.
+        level: inputs before a record that begins at rest, (nu,).
+    """
+    found, longest = [], max(delay, default=0)
+    for record in records:
+        later = record.delayed(delay, level)
+        if longest and record.start in ("estimated", "measured"):
+            if record.samples <= longest + 1:
+                raise InputError(
+                    f"record '{record.name}' has {record.samples} samples, and the delay is "
+                    f"{longest}; give longer records or a smaller delay."
+                )
+            skip = max(record.skip - longest, int(record.start == "measured" and record.skip > 0))
+            later = replace(later, valid=record.valid).part(
+                slice(longest, None), start=record.start, skip=skip, period=None
+            )
+        found.append(later)
+    return found
+
+
+def resting_level(records: Sequence[Record], delay: Delay) -> np.ndarray:
+    """Mean of each input (nu,) over the samples that act within the records."""
+    columns = []
+    for j, d in enumerate(delay):
+        acting = [r.u[: r.samples - d if r.start == "zero" else None, j] for r in records]
+        columns.append(np.concatenate(acting).mean())
+    return np.array(columns)
+
+
+def find_delay(
+    records: Sequence[Record],
+    nx: int | None,
+    *,
+    watch: Callable[[str], None] = lambda _: None,
+    **options: Any,
+) -> Delay:
+    """Whole samples by which each input acts later, as the errors of linear models tell.
+
+    The search begins where past inputs begin to explain the outputs. For several inputs, each in
+    turn gets its best delay.
+
+    Args:
+        records: records as they were measured.
+        nx: order of the linear models. None: chosen.
+        watch: called with a line on the result.
+        options: arguments of ``estimate_bla``.
+    """
+    nu = len(records[0].inputs)
+    most = int(_LARGEST * min(record.samples for record in records))
+
+    def acting(delay: Delay) -> list[Record]:
+        level = np.zeros(nu)
+        if options.get("offset", True):
+            level = resting_level(records, delay)
+        return delayed_records(records, delay, level)
+
+    delay = tuple(min(_seen(records, j), most) for j in range(nu))
+    if nx is None:
+        few = {**options, "max_iter": _ITERATIONS}
+        nx = scan_orders(acting(delay), _ORDERS, **few).chosen
+    order, errors = max(nx, _LEAST), dict[Delay, float]()
+
+    def error(delay: Delay) -> float:
+        """Error of the linear model, normalised."""
+        if delay not in errors:
+            fit = estimate_bla(acting(delay), order, **options).fit
+            errors[delay] = math.inf if fit is None else fit.rmse
+        return errors[delay]
+
+    rows = sum(record.y.size for record in records)
+    for j in range(nu):
+        delay = _best(delay, j, most, error, rows)
+    names = [channel.name for channel in records[0].inputs]
+    told = ", ".join(f"{name} {d}" for name, d in zip(names, delay, strict=True))
+    watch(f"delay in samples: {told}, by linear models of order {order}")
+    return delay
+
+
+def _best(delay: Delay, j: int, most: int, error: Callable[[Delay], float], rows: int) -> Delay:
+    """The delay with the best value of input j: the largest that is as good as the best found."""
+
+    def at(d: int) -> Delay:
+        return (*delay[:j], d, *delay[j + 1 :])
+
+    tried = {d: error(at(d)) for d in ([delay[j]] if delay[j] else _COARSE) if d <= most}
+    while True:
+        best = min(tried, key=lambda d: tried[d])
+        near = range(max(0, best - NEAR), min(most, best + NEAR) + 1)
+        new = [d for d in near if d not in tried]
+        if not new:
+            break
+        tried |= {d: error(at(d)) for d in new}
+    limit = tried[best] * math.sqrt(1.0 + _ALIKE / rows)
+    return at(max(d for d in near if tried[d] <= limit))
+
+
+def _seen(records: Sequence[Record], j: int) -> int:
+    """Dead time of an input that past inputs show, the least over the outputs; 0 if unclear."""
+    record = max(records, key=lambda one: one.samples)
+    u, found = record.u[:, j], []
+    for y in record.y.T:
+        response = two_sided_response(u, y)
+        clear = 0 if response is None else dead_time(u, y, response.peak)
+        found += [clear] if clear else []
+    return cast(int, min(found, default=0))
