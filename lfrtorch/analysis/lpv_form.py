@@ -196,6 +196,7 @@ def lpv(
         >>> form.A.shape, bool(np.isfinite(form.bounds).all())
         ((2, 1, 1), True)
     """
+    model = model.with_delay_line()
     (cell, u0, v0, x0), s = about(model, u, x), model.scaler
     neurons = cell.map.neurons
     if schedule not in (None, "neurons", "map"):

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -29,9 +29,6 @@ Delay = tuple[int, ...]
 
 NEAR = 2
 """Delays at least so far from the best are compared."""
-
-_COARSE = (0, 1, 2, 4, 8, 16, 32, 64)
-"""Delays that are tried first where past inputs do not show one."""
 
 _ORDERS, _ITERATIONS = range(1, 4), 15
 """Orders among which that of the search is chosen, and iterations for each."""
@@ -108,35 +105,46 @@ def find_delay(
             level = resting_level(records, delay)
         return delayed_records(records, delay, level)
 
-    delay = tuple(min(_seen(records, j), most) for j in range(nu))
+    seen = [[d for d in _seen(records, j) if d <= most] or [most] for j in range(nu)]
+    delay = tuple(min(own) for own in seen)
     if nx is None:
         few = {**options, "max_iter": _ITERATIONS}
         nx = scan_orders(acting(delay), _ORDERS, **few).chosen
-    order, errors = max(nx, _LEAST), dict[Delay, float]()
+    errors: dict[tuple[int, Delay], float] = {}
 
-    def error(delay: Delay) -> float:
+    def error(delay: Delay, order: int = max(nx, _LEAST)) -> float:
         """Error of the linear model, normalised."""
-        if delay not in errors:
+        if (order, delay) not in errors:
             fit = estimate_bla(acting(delay), order, **options).fit
-            errors[delay] = math.inf if fit is None else fit.rmse
-        return errors[delay]
+            errors[order, delay] = math.inf if fit is None else fit.rmse
+        return errors[order, delay]
 
     rows = sum(record.y.size for record in records)
     for j in range(nu):
-        delay = _best(delay, j, most, error, rows)
+        delay = _best(delay, j, seen[j], most, error, rows)
+        if nx < _LEAST:  # the state that the search has more may stand for one sample
+            later = (*delay[:j], min(delay[j] + 1, most), *delay[j + 1 :])
+            delay = min(delay, later, key=lambda d: error(d, nx))
     names = [channel.name for channel in records[0].inputs]
     told = ", ".join(f"{name} {d}" for name, d in zip(names, delay, strict=True))
-    watch(f"delay in samples: {told}, by linear models of order {order}")
+    watch(f"delay in samples: {told}, by linear models of order {max(nx, _LEAST)}")
     return delay
 
 
-def _best(delay: Delay, j: int, most: int, error: Callable[[Delay], float], rows: int) -> Delay:
+def _best(
+    delay: Delay,
+    j: int,
+    seen: Sequence[int],
+    most: int,
+    error: Callable[[Delay], float],
+    rows: int,
+) -> Delay:
     """The delay with the best value of input j: the largest that is as good as the best found."""
 
     def at(d: int) -> Delay:
         return (*delay[:j], d, *delay[j + 1 :])
 
-    tried = {d: error(at(d)) for d in ([delay[j]] if delay[j] else _COARSE) if d <= most}
+    tried = {d: error(at(d)) for d in seen}
     while True:
         best = min(tried, key=lambda d: tried[d])
         near = range(max(0, best - NEAR), min(most, best + NEAR) + 1)
@@ -148,12 +156,14 @@ def _best(delay: Delay, j: int, most: int, error: Callable[[Delay], float], rows
     return at(max(d for d in near if tried[d] <= limit))
 
 
-def _seen(records: Sequence[Record], j: int) -> int:
-    """Dead time of an input that past inputs show, the least over the outputs; 0 if unclear."""
+def _seen(records: Sequence[Record], j: int) -> list[int]:
+    """Dead times of an input to compare: that which past inputs show, or those by the response."""
     record = max(records, key=lambda one: one.samples)
-    u, found = record.u[:, j], []
+    u, clear, unclear = record.u[:, j], [], {0}
     for y in record.y.T:
         response = two_sided_response(u, y)
-        clear = 0 if response is None else dead_time(u, y, response.peak)
-        found += [clear] if clear else []
-    return cast(int, min(found, default=0))
+        if response is not None:
+            clear.append(dead_time(u, y, response.peak))
+            unclear |= {response.peak // 2, response.peak}
+    least = min((one for one in clear if one), default=0)
+    return [least] if least else sorted(unclear)

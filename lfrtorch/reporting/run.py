@@ -114,7 +114,7 @@ class Run:
         if self.parameters is not None:
             parts.append(f"\n{self.parameters}\n")
         if self.dead_times:
-            parts.append(f"dead time of {'; '.join(map(str, self.dead_times))}\n")
+            parts.append(f"\ndead time of {'; '.join(map(str, self.dead_times))}\n")
         if self.metrics["stable_to"] < max(LOUDER):
             parts.append(f"note: {scores.stability(self.metrics['stable_to'])}")
         if self.memory is not None and not self.memory.fades:
