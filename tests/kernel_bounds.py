@@ -172,7 +172,8 @@ def planted() -> None:
         (lfrtorch.Channel("a"),),
         LFR(LFRCell(1, 1, 1, dtype=torch.float64, random=False)),
     )
-    made = lfrtorch.Model(lfr, lfrtorch.Scaler(*np.ones((4, 1))), 1.0, channel, channel)
+    one = np.ones(1)
+    made = lfrtorch.Model(lfr, lfrtorch.Scaler(one, one, one, one), 1.0, channel, channel)
     observer = made.observer(noise=NoiseCovariance(1, 1))
     call = observer._call  # pyright: ignore[reportAttributeAccessIssue]
     assert call is not None

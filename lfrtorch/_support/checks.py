@@ -71,16 +71,10 @@ def dft_lines(given: ArrayLike, samples: int) -> Integers:
     return np.unique(found).astype(np.int64)
 
 
-def number(
-    name: str, value: Any, *, positive: bool = False, most: float | None = None, word: str = ""
-) -> None:
-    """Refuse all but a real number of at least (``positive``: above) 0 with a ValueError.
-
-    ``word`` is a word that the caller takes in its place.
-    """
+def number(name: str, value: Any, *, positive: bool = False, most: float | None = None) -> None:
+    """Refuse all but a real number of at least (``positive``: above) 0 with a ValueError."""
     wanted = "a positive number" if positive else "a number of at least 0"
     wanted += "" if most is None else f", {most} at most"
-    wanted += f", or {word}" if word else ""
     real = isinstance(value, Real) and not isinstance(value, bool) and float(value) < math.inf
     small = not real or not (float(value) > 0 if positive else float(value) >= 0)
     if small or (most is not None and float(value) > most):

@@ -35,7 +35,7 @@ _FARTHEST = 3.0
 """Samples before and after the first sample of the response in which it is looked at: whole delays
 are found to about two samples."""
 
-_STEP = 0.01
+_STEP = 0.002
 """Step of these times, in samples."""
 
 _FASTEST = 1e-6
@@ -116,24 +116,13 @@ def _intervals(model: LinearModel) -> Float[Array, "nu 2"]:
 
 def _interval(t: Array, s: Array, std: Array) -> tuple[float, float]:
     """The interval in which s is zero within two standard errors, nearest to the first sample."""
-    ratio = np.abs(s) / std
-    crossed = s[1:] * s[:-1] <= 0
-    near = np.abs(t + _WITHIN)
-    zero = ratio <= 2.0
-    k = np.flatnonzero(crossed)
-    if len(k):  # between two times, if it is steep
-        k = k[np.argmin(near[k])]
-        slope = (s[k + 1] - s[k]) / _STEP
-        at, own = t[k] - s[k] / slope, 2 * std[k] / abs(slope)
-        if own < 2 * _STEP and not (zero & (near < abs(at + _WITHIN))).any():
-            return float(at - own), float(at + own)
-    if not zero.any():
-        zero = ratio**2 <= ratio.min() ** 2 + 4.0
+    ratio, near = np.abs(s) / std, np.abs(t + _WITHIN)
+    zero = ratio**2 <= max(0.0, ratio.min() ** 2 - 4.0) + 4.0
     best = np.flatnonzero(zero)[np.argmin(near[zero])]
     apart = np.flatnonzero(~zero)
     first = apart[apart < best].max(initial=-1) + 1
     last = apart[apart > best].min(initial=len(t)) - 1
-    return float(t[first]), float(t[last])
+    return float(t[first]) - _STEP / 2, float(t[last]) + _STEP / 2
 
 
 def _steps(model: LinearModel, theta: Array, t: Float[Array, " t"]) -> Float[Array, "t ny nu"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from inspect import signature
 from typing import Any, Literal, cast
@@ -12,7 +12,7 @@ import torch
 from torch.nn import Module
 
 from lfrtorch._support.arguments import typed
-from lfrtorch._support.checks import integer, number
+from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.settings import check_settings, documented, setting
 from lfrtorch.engine.cell import check_dtype
@@ -171,14 +171,21 @@ class Settings(PlainSettings):
 
     def _take_delay(self) -> None:
         """Refuse delays that are no numbers; several become a tuple."""
-        given: Any = self.delay
-        if isinstance(given, str) and given == "auto":
+        given = np.asarray(self.delay)
+        if given.ndim == 0 and given.item() == "auto":
             return
-        several = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str)
-        for one in given if several else [given]:
-            number("delay", one, word="auto")
-        if several:
-            object.__setattr__(self, "delay", tuple(given))
+        if (
+            given.ndim > 1
+            or given.dtype.kind not in "iuf"
+            or not ((given >= 0) & (given < np.inf)).all()
+        ):
+            raise InputError(
+                f"delay is {self.delay!r}; give 'auto', or a number of at least 0, or one for each "
+                "input: samples."
+            )
+        object.__setattr__(
+            self, "delay", given.item() if given.ndim == 0 else tuple(given.tolist())
+        )
 
     def _check_known(self) -> None:
         """Refuse settings that a known model cannot have."""

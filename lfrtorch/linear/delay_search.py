@@ -27,11 +27,14 @@ from lfrtorch.survey.causality import dead_time, two_sided_response
 
 Delay = tuple[int, ...]
 
-NEAR = 2
+_NEAR = 2
 """Delays at least so far from the best are compared."""
 
-_ORDERS, _ITERATIONS = range(1, 4), 15
-"""Orders among which that of the search is chosen, and iterations for each."""
+_ORDERS = range(1, 4)
+"""Orders among which that of the search is chosen."""
+
+_ITERATIONS = 15
+"""Iterations for each of these orders."""
 
 _LEAST = 2
 """Least order of the search: one lag with a delay stands for several lags, with a smaller one."""
@@ -147,7 +150,7 @@ def _best(
     tried = {d: error(at(d)) for d in seen}
     while True:
         best = min(tried, key=lambda d: tried[d])
-        near = range(max(0, best - NEAR), min(most, best + NEAR) + 1)
+        near = range(max(0, best - _NEAR), min(most, best + _NEAR) + 1)
         new = [d for d in near if d not in tried]
         if not new:
             break

@@ -24,7 +24,7 @@ from lfrtorch import (
 )
 from lfrtorch.cli.config import configured
 from lfrtorch.fitting.observer import Observer
-from lfrtorch.reporting import write
+from lfrtorch.reporting.html import render
 
 DELAY = 6
 SHORT = LevenbergMarquardt(max_iter=12)
@@ -66,9 +66,8 @@ def test_it_is_found_and_told(dataset: Dataset, tmp_path: Path):
     for test in dataset.tests:
         assert scores[test.name]["rmse"] == pytest.approx(rmse(test, run.model.simulate(test)))
         assert scores[test.name]["rmse"] < 0.05
-    write(run, tmp_path, draw=False)
-    assert "Dead time of u:" in (tmp_path / "report.html").read_text()
-    again = load(tmp_path / "model")
+    assert "Dead time of u:" in render(run, {})
+    again = load(run.model.save(tmp_path / "model"))
     assert again.delay == run.model.delay
     assert again.information is not None
 
@@ -128,7 +127,7 @@ def test_it_goes_with_every_setting(dataset: Dataset, more: dict[str, Any]):
 @pytest.mark.parametrize(
     "start", ["estimated", "periodic", pytest.param("measured", marks=pytest.mark.slow)]
 )
-def test_it_goes_with_every_start(start: str):
+def test_it_goes_with_every_start(start: Any):
     u = np.tile(np.random.default_rng(0).standard_normal(200), 3)
     y, late = np.zeros(600), np.concatenate([np.zeros(DELAY), u])
     for k in range(599):
@@ -157,7 +156,8 @@ def test_known_equations_have_it(dataset: Dataset):
 
 def test_a_model_to_start_from_brings_its_own(dataset: Dataset):
     first = identify(dataset, settings(delay=DELAY), observer=Observer()).model
-    for delay, found in ((0, DELAY), ("auto", DELAY), (DELAY + 1, DELAY + 1)):
+    cases: tuple[tuple[Any, int], ...] = ((0, DELAY), ("auto", DELAY), (DELAY + 1, DELAY + 1))
+    for delay, found in cases:
         more = Settings(init_from=first, delay=delay, trainer=LevenbergMarquardt(max_iter=2))
         run = identify(dataset, more, observer=Observer())
         assert run.model.delay == (found,)

@@ -32,13 +32,16 @@ def test_a_model_of_the_guide_is_fitted(text: str):
     u = 2.0 + 0.5 * u if "tank" in names else u  # a pump does not suck
     model = names["known"].map(1, ["y"], 10.0)
     x, y = torch.zeros(model.nx, dtype=torch.float64), []
-    for value in torch.from_numpy(u):
+    for value in torch.from_numpy(np.roll(u, settings.delay)):
         x, output = model(torch.cat([x, value[None]])).detach().split([model.nx, 1])
         y.append(float(output))
     assert np.isfinite(y).all()
     record = Record(u, np.array(y), fs=10.0, start="estimated")
     short = {"trainer": LevenbergMarquardt(max_iter=3), "starts": 1}
-    options = {name: getattr(settings, name) for name in ("known", "nx", "nz", "nw", "nn", "ridge")}
+    options = {
+        name: getattr(settings, name)
+        for name in (*("known", "nx", "nz", "nw", "nn", "ridge", "delay"),)
+    }
     run = lfrtorch.identify(
         Dataset("guide", [record], [], []), lfrtorch.Settings(**options, **short)
     )
