@@ -65,6 +65,7 @@ def known_model(known: Known, linear: LinearModel, records: Sequence[Record]) ->
         rms_scale([r.u for r in records], linear.u_offset),
         linear.y_offset,
         rms_scale([r.y for r in records], linear.y_offset),
+        linear.delay,
     )
     static = known.map(nu, [channel.name for channel in first.outputs], first.fs)
     with torch.no_grad():
@@ -145,7 +146,7 @@ def with_learned(model: Model, records: Sequence[Record], settings: Settings, se
     with torch.no_grad():
         found = [model.signals(record) for record in records]
         x = torch.cat([t.x[0, :-1] for t in found])
-        u = torch.cat([torch.as_tensor(model.scaler.normalise_u(r.u)) for r in records])
+        u = torch.cat([torch.as_tensor(model.scaler.normalise(r).u) for r in records])
         if states:
             corners = relaxation_frequencies([record.u for record in records], states)
             decay = torch.as_tensor(np.exp(-corners))

@@ -131,7 +131,8 @@ def _signals(model: Model, records: Sequence[Record]) -> tuple[list[Array], list
     total = sum(record.samples for record in records)
     inputs, outputs, scored = list[Array](), list[Array](), list[Booleans]()
     for record in records:
-        u, y = model.scaler.normalise_u(record.u), model.scaler.normalise_y(record.y)
+        normalised = model.scaler.normalise(record)
+        u, y = normalised.u, normalised.y
         own = record.factors > 0
         if record.start == "estimated":
             own[: min(record.samples // 8, _UNKNOWN)] = False

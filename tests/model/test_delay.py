@@ -22,6 +22,7 @@ from lfrtorch import (
     estimate_bla,
     export,
     fit,
+    initialise,
     load,
     simulate_blocks,
     update,
@@ -231,3 +232,14 @@ def test_past_outputs_are_not_delayed(model: Model, record: Record):
 def test_delays_that_cannot_be_are_refused(model: Model, delay: object):
     with pytest.raises(InputError, match="delay"):
         model.delayed(delay)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("method", ["zero_output", "random_states", "paper"])
+def test_a_start_takes_the_delay_of_its_linear_model(record: Record, method: Any):
+    (shifted,) = delayed_records([record], DELAYS, np.zeros(3))
+    linear = replace(estimate_bla(shifted, 3), delay=DELAYS)
+    begun = initialise(linear, record, nz=1, nw=1, nn=3, method=method)
+    assert begun.delay == DELAYS
+    close(linear.simulate(record), linear.to_model().simulate(record))
+    if method == "zero_output":
+        close(begun.simulate(record), linear.simulate(record))
