@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -61,9 +61,12 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
         "command": command,
     }
     print(f"\n{in_lines(found['verdict']['text'])}\n\n{linear_report.table(found, evaluation)}")
-    for time in dead_times(replace(model, delay=job.delay)) if job.delay else ():
-        print(f"\ndead time of {time}")
-    replace(model, delay=job.delay).save(folder / "linear")
+    model = replace(model, delay=job.delay)
+    times = dead_times(model) if job.delay else ()
+    for one in times:
+        print(f"\ndead time of {one}")
+    found["dead_times"] = [asdict(one) for one in times]
+    model.save(folder / "linear")
     text = json.dumps(found, indent=2, allow_nan=False)
     with whole_file(folder / "linear.json") as fresh:
         fresh.write_text(text + "\n")

@@ -79,12 +79,8 @@ def _delay(job: Job) -> Delay:
         if begins_at_outputs(train):
             nx = len(train[0].outputs)
             train = [replace(record, start="estimated") for record in train]
-        found = find_delay(
-            linear_records(train, own, job.observer),
-            nx,
-            watch=job.observer.say,
-            **own.linear,
-        )
+        records, watch = linear_records(train, own, job.observer), job.observer.say
+        found = find_delay(records, nx, watch=watch, **own.linear)
         # Rounding may differ between processes, so the first process decides.
         return tuple(agreed(torch.tensor(found)).tolist())
     each = given if isinstance(given, tuple) else (given,) * nu

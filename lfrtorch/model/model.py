@@ -269,12 +269,9 @@ class Model:
         """
         if not any(self.delay):
             return self
-        whole = LFR(delay_line_cell(self.lfr.cell, self.delay))
-        K = (
-            None
-            if self.K is None
-            else torch.cat([self.K, self.K.new_zeros(sum(self.delay), len(self.outputs))])
-        )
+        whole, K = LFR(delay_line_cell(self.lfr.cell, self.delay)), self.K
+        if K is not None:
+            K = torch.cat([K, K.new_zeros(sum(self.delay), K.shape[1])])
         scaler = replace(self.scaler, delay=())
         return replace(self, lfr=whole, scaler=scaler, K=K, information=None)
 

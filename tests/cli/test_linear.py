@@ -252,3 +252,17 @@ def test_train_takes_the_order_of_a_scan(csv: Path, tmp_path: Path, capsys):
     printed = capsys.readouterr().out
     assert "  chosen" in printed
     assert "BLA: order 2, simulation error" in printed
+
+
+def test_a_dead_time_is_found_and_kept(tmp_path: Path, monkeypatch, undrawn, capsys):
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal(600), np.zeros(600)
+    for k in range(599):
+        y[k + 1] = 0.8 * y[k] + (u[k - 4] if k >= 4 else 0.0)
+    path = written(tmp_path / "late.csv", u=u, y=y + 0.02 * rng.standard_normal(600))
+    words = overrides(path, "u", "y", "nx=1", "delay=auto")
+    found = run(monkeypatch, tmp_path / "run", *words)
+    (time,) = found["dead_times"]
+    assert abs(time["samples"] - 4) < max(3 * time["std"], 0.05)
+    assert "dead time of u: " in capsys.readouterr().out
+    assert lfrtorch.LinearModel.load(tmp_path / "run" / "linear").delay in ((4,), (5,))
