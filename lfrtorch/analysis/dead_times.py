@@ -117,7 +117,7 @@ def _intervals(model: LinearModel) -> Float[Array, "nu 2"]:
 def _interval(t: Array, s: Array, std: Array) -> tuple[float, float]:
     """The interval in which s is zero within two standard errors, nearest to the first sample."""
     ratio, near = np.abs(s) / std, np.abs(t + _WITHIN)
-    zero = ratio**2 <= max(0.0, ratio.min() ** 2 - 4.0) + 4.0
+    zero = ratio**2 <= ratio.min() ** 2 + 4.0
     best = np.flatnonzero(zero)[np.argmin(near[zero])]
     apart = np.flatnonzero(~zero)
     first = apart[apart < best].max(initial=-1) + 1
@@ -133,9 +133,9 @@ def _steps(model: LinearModel, theta: Array, t: Float[Array, " t"]) -> Float[Arr
     M[:nx, :nx], M[:nx, nx:] = A.reshape(nx, nx), B.reshape(nx, nu)
     # A pole on the negative real axis has a complex logarithm; its part is real at samples alone.
     G = np.asarray(scipy.linalg.logm(M))
-    one, power = scipy.linalg.expm(_STEP * G), scipy.linalg.expm(t[0] * G)
-    found = np.empty((len(t), nx, nu))
-    for k in range(len(t)):
-        found[k] = power[:nx, nx:].real
-        power = power @ one
-    return C.reshape(ny, nx) @ found + D.reshape(ny, nu)
+    one, chunk = scipy.linalg.expm(_STEP * G), round(len(t) ** 0.5)
+    fine = np.stack([np.linalg.matrix_power(one, k) for k in range(chunk)])
+    coarse = np.stack([scipy.linalg.expm(begin * G) for begin in t[::chunk]])
+    power = np.real(coarse[:, None] @ fine).reshape(-1, nx + nu, nx + nu)
+    x = power[: len(t), :nx, nx:]
+    return C.reshape(ny, nx) @ x + D.reshape(ny, nu)

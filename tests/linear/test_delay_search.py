@@ -81,6 +81,7 @@ def test_models_of_two_orders_have_the_interval_of_both():
     assert found.std == pytest.approx((high - low) / 4)
 
 
+@pytest.mark.slow
 def test_the_order_is_not_raised():
     u = held(0)
     record = Record(u, noisy(lags(u, (8.0,), 9.0)))
@@ -106,6 +107,7 @@ def test_the_first_output_that_reacts_tells():
     assert abs(found.samples - 4.6) < 1.0
 
 
+@pytest.mark.slow
 def test_a_steady_state_repeats():
     u = multisine(256, band=(0.004, 0.3), fs=1.0, rms=1.0, seed=1).u[0, :, 0]
     y = lags(np.tile(u, 3), (6.0,), 21.0)[512:]
