@@ -106,6 +106,7 @@ def planted(number: int) -> list[tables.Cell]:
     settings = lfrtorch.Settings(nx="auto", nz=1, nn=8, delay="auto")
     run = lfrtorch.identify(data, settings, observer=lfrtorch.Observer())
     found = run.dead_times[0] if run.dead_times else None
+    print(f"dead time of {found}, delay {run.model.delay[0]}")
     samples, std = (found.samples, found.std) if found else (0.0, float("nan"))
     return [
         number, plant.kind, len(plant.lags), plant.delay, samples, std,

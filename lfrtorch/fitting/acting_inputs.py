@@ -10,12 +10,13 @@ import torch
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.data.dataset import Dataset
+from lfrtorch.data.delayed_records import Delay, delayed_records, resting_level
 from lfrtorch.distributed import agreed
 from lfrtorch.fitting.linear_start import linear_records, of_linear_model
 from lfrtorch.fitting.stage import Job, Stage
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.fitting.windows import begins_at_outputs
-from lfrtorch.linear.delay_search import Delay, delayed_records, find_delay, resting_level
+from lfrtorch.linear.delay_search import find_delay
 
 
 class ActingInputs(Stage):

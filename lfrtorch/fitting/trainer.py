@@ -17,6 +17,7 @@ from torch import Tensor
 from lfrtorch._support.errors import InputError, LfrtorchError
 from lfrtorch._support.reasons import Reason, told
 from lfrtorch._support.threads import spread_by_hand
+from lfrtorch.data.delayed_records import delayed_records
 from lfrtorch.data.records import Record, as_records
 from lfrtorch.distributed import ProcessLostError
 from lfrtorch.fitting import state_file
@@ -29,7 +30,6 @@ from lfrtorch.least_squares.residual import Point
 from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.least_squares.search import Search
 from lfrtorch.least_squares.shared_problem import problem_of
-from lfrtorch.linear.delay_search import delayed_records
 from lfrtorch.model.model import Model
 
 EXPLOSION = 100.0

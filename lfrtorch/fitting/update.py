@@ -36,6 +36,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number as digits
 from lfrtorch._support.tables import table
 from lfrtorch._support.types import Array
+from lfrtorch.data.delayed_records import delayed_records
 from lfrtorch.data.paired_blocks import Judge
 from lfrtorch.data.records import Record, as_records, with_past_outputs
 from lfrtorch.engine.operating_point import double, equilibrium, linearised_at
@@ -54,7 +55,6 @@ from lfrtorch.least_squares.guarantee import guarantee_of
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.search import Search
-from lfrtorch.linear.delay_search import delayed_records
 from lfrtorch.model.information import Information
 from lfrtorch.model.model import Model
 

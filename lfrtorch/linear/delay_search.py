@@ -14,18 +14,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from lfrtorch._support.errors import InputError
+from lfrtorch.data.delayed_records import Delay, delayed_records, resting_level
 from lfrtorch.data.records import Record
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.order_scan import scan_orders
 from lfrtorch.survey.causality import dead_time, two_sided_response
-
-Delay = tuple[int, ...]
 
 _NEAR = 2
 """Delays at least so far from the best are compared."""
@@ -45,40 +42,6 @@ _LARGEST = 1 / 4
 _ALIKE = 4.0
 """Delays are as good as the best if the squared errors, over their variance, add up to so much
 more: two standard deviations of one parameter. The largest of these is taken."""
-
-
-def delayed_records(records: Sequence[Record], delay: Delay, level: Any) -> list[Record]:
-    """Records with their inputs as they act; unknown first inputs are cut off with their outputs.
-
-    Args:
-        records: the records.
-        delay: whole samples of each input.
-        level: inputs before a record that begins at rest, (nu,).
-    """
-    found, longest = [], max(delay, default=0)
-    for record in records:
-        later = record.delayed(delay, level)
-        if longest and record.start in ("estimated", "measured"):
-            if record.samples <= longest + 1:
-                raise InputError(
-                    f"record '{record.name}' has {record.samples} samples, and the delay is "
-                    f"{longest}; give longer records or a smaller delay."
-                )
-            skip = max(record.skip - longest, int(record.start == "measured" and record.skip > 0))
-            later = replace(later, valid=record.valid).part(
-                slice(longest, None), start=record.start, skip=skip, period=None
-            )
-        found.append(later)
-    return found
-
-
-def resting_level(records: Sequence[Record], delay: Delay) -> np.ndarray:
-    """Mean of each input (nu,) over the samples that act within the records."""
-    columns = []
-    for j, d in enumerate(delay):
-        acting = [r.u[: r.samples - d if r.start == "zero" else None, j] for r in records]
-        columns.append(np.concatenate(acting).mean())
-    return np.array(columns)
 
 
 def find_delay(

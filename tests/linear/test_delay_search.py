@@ -10,7 +10,8 @@ from scipy.linalg import expm
 
 from lfrtorch import InputError, Record, estimate_bla, multisine
 from lfrtorch.analysis import dead_times
-from lfrtorch.linear.delay_search import delayed_records, find_delay, resting_level
+from lfrtorch.data.delayed_records import delayed_records, resting_level
+from lfrtorch.linear.delay_search import find_delay
 from lfrtorch.linear.model import LinearModel
 
 T = 1500

@@ -28,10 +28,10 @@ from lfrtorch import (
     update,
 )
 from lfrtorch.analysis import linearise, uncertainty
+from lfrtorch.data.delayed_records import delayed_records
 from lfrtorch.data.records import with_past_outputs
 from lfrtorch.engine.record_starts import STARTS
 from lfrtorch.export.targets import TARGETS
-from lfrtorch.linear.delay_search import delayed_records
 
 DELAYS = (2, 0, 5)
 
